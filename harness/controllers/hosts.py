@@ -329,10 +329,10 @@ def _numbers(n: int, answer: Any) -> tuple[FloatArray | None, str | None]:
     That of a policy may be (n, 1).
     """
     found = np.ma.array(answer, object).filled(np.nan) if np.ma.is_masked(answer) else np.array(answer)
-    if found.shape == (n, 1):
-        found = found[:, 0]
+    found = found[:, 0] if found.shape == (n, 1) else found
     if found.shape != (n,):
-        return None, f"returned an array of shape {found.shape}, expected ({n},)"
+        what = "None (is a return missing?)" if answer is None else f"{type(answer).__name__} of shape {found.shape}"
+        return None, f"returned {what}, expected ({n},)"
     are_no_numbers = found.dtype == object and any(isinstance(each, str | bytes | np.timedelta64) for each in found)
     if found.dtype.kind not in "iufO" or are_no_numbers:
         return None, f"returned an array of {found.dtype}, expected accelerations in m/s2 as numbers"

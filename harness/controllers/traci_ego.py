@@ -112,17 +112,17 @@ def _found(script: TraciScript) -> tuple[str | None, str]:
     Names are first taken as they come, each for the AV; those that came are then tried, one after the other.
     """
     anybody = _AnyName(VEH_ID)
-    commanded, wrong = _commanded(script, anybody)
+    commanded, *wrong = _commanded(script, anybody)
     named = [name for name in commanded if name is not anybody]
     for name in dict.fromkeys((named + list(anybody.asked)) or [VEH_ID] * bool(commanded)):
         if len(named) < 2:
             named, failed = _commanded(script, name)
-            wrong = failed or wrong
+            wrong.insert(-1, failed)
         if len(named) > 1:
             return None, f"commands {' and '.join(named)}"
         if named == [name] and not failed:
             return name, ""
-    return None, f"{FAILS}: {wrong}" if wrong else "commands no vehicle before a cut-in"
+    return None, f"{FAILS}: {why}" if (why := next(filter(None, wrong), "")) else "commands no vehicle before a cut-in"
 
 
 def _commanded(script: TraciScript, ego: str) -> tuple[list[str], str]:

@@ -308,7 +308,8 @@ def test_what_is_loaded_is_loaded_once_a_process_and_shared_and_nothing_else_is(
         (np.array(["1", 2.0], object), None, "an array of object, expected accelerations"),
         (np.array([np.timedelta64(1, "s"), 2.0], object), None, "an array of object, expected accelerations"),
         (["1", "2"], None, "an array of <U1, expected accelerations"),
-        ([1.0], None, "an array of shape (1,), expected (2,)"),
+        ([1.0], None, "returned list of shape (1,), expected (2,)"),
+        (None, None, "returned None (is a return missing?), expected (2,)"),
     ],
 )
 def test_what_a_batch_controller_may_answer(answer, numbers, wrong):
@@ -320,7 +321,7 @@ def test_what_a_batch_controller_may_answer(answer, numbers, wrong):
 @pytest.mark.parametrize(
     ("wrong", "words"),
     [
-        ({"wrong_shape": True}, "an array of shape ("),
+        ({"wrong_shape": True}, "ndarray of shape ("),
         ({"wrong_type": "complex"}, "an array of complex128, expected accelerations in m/s2 as numbers"),
     ],
 )

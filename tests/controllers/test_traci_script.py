@@ -135,6 +135,9 @@ AT_THE_DOOR = {
     r"traci.vehicle has no getEmissionClass here: delete the line, or put in a value of your own \(my.py:7\)$": text(
         "traci.vehicle.setSpeed('ego', 9.0); traci.vehicle.getEmissionClass('ego')"
     ),
+    "'truck' is not known, or not seen yet: there are LV, BV, ego": text(
+        "traci.vehicle.setSpeed('ego', 9.0); traci.vehicle.getSpeed('truck')"
+    ),
     r"which is no Python.*invalid syntax in line 2": "import traci\ndef x(:\n",
     r"--step-length 0.25 is refused: steps here are 0.1 s.*\(my.py:3\)": text("").replace(
         '"sumo"', '"sumo", "--step-length", "0.25"'
