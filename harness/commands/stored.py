@@ -199,7 +199,7 @@ def sensitivity(folder: Path, *, ranges: dict[str, tuple[float, float]], as_json
     say(
         *([f"{n_still} more numbers move neither by {share(LEAST_MOVE)}."] if n_still else ()),
         "Under 'rate' and 'ratio' (to the competent driver) the left value is by how much they are multiplied with the "
-        "number at its lower end, the right one at its upper end.",
+        "number at its lower end, the right one at its upper end; '–': these tests do not tell it.",
         "This assumes that the same share of each shell's events end in a crash; 'error' is by how much that is wrong "
         "for a reference driver.",
         f"report  {page}",

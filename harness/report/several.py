@@ -109,8 +109,7 @@ def sum_warnings(content: Mapping[str, Any]) -> Iterator[str]:
     decision, ends = content.get("decision"), content["beside"]["over_assumed"]
     asked = decision["limit"] if decision and decision["driver"] and decision["verdict"] != "undecided" else math.nan
     if ends is not None and ends[0] <= asked <= ends[1]:
-        over = f"{ratio(ends[0])} to {ratio(ends[1])}"
-        yield f"this verdict rests on assumed numbers: over their ranges it is {over} times the competent driver"
+        yield f"assumed numbers may turn this verdict: × {ratio(ends[0])} to {ratio(ends[1])} over their ranges"
     for name, of in content["families"].items():
         told = list(words.warnings_of(name, {**of, "rate": of["rate_per_hour"]}, " per hour"))
         if (left := of.get("assumed")) and (found := AssumedOfRate(**left)).no_lower_limit:

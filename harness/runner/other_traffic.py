@@ -297,6 +297,7 @@ def _of_sum(folder: Path, ranges: Mapping[str, tuple[float, float]], progress: P
             low, high = (end / exposure["per_hour"] for end in ends)
             known: Literal["counted", "assumed"] = "counted" if exposure["counted"] else "assumed"
             bars.append(_part(Bar(f"exposure {name}", known, ends, (low, high), (1.0, 1.0), (0.0, 0.0)), *shares))
+        progress.remark = f" ({name.replace('_', ' ')})"
         try:
             found = _of_one(folder / name, of_numbers[name], progress, per_event=True)
         except CampaignError as refused:
