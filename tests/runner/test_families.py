@@ -224,7 +224,7 @@ def test_what_other_traffic_does_to_a_scenario_is_said_once(run):
     assert f"lead brakes 0.1 ({EXCLUDED})" in " ".join(fitted.split())
     verdict = Decision(1.0, "assumption_free", 0.95, 2.5, 40.0, driver="r157-cc").to_json()
     report = run.folder / "report.html"
-    assert (len(hour_lines(content, report)), len(hour_lines({**content, "decision": verdict}, report))) == (10, 12)  # what may turn it
+    assert (len(hour_lines(content, report)), len(hour_lines({**content, "decision": verdict}, report))) == (10, 12)
 
 
 def test_what_moves_one_scenario_moves_the_sum_by_its_share(run, tmp_path, monkeypatch, capsys):
