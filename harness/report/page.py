@@ -17,7 +17,7 @@ from harness.report import several
 from harness.report.crashes import Replay, crash_gallery, crashing_pairs, scenes_of, shown_of
 from harness.report.drawing import Plot
 from harness.report.plots import convergence_plot, sensitivity_plot, severity_plot, shells_plot, where_plot
-from harness.report.summary import RunFolder, RunSummary, lateral_facts, summarise
+from harness.report.summary import RunFolder, RunSummary, lateral_facts, summarise, typed
 from harness.report.templates import write_page
 from harness.report.words import short_answer
 from harness.vocabulary import FAILED, OUTCOMES
@@ -39,7 +39,7 @@ def write_page_of(run: RunFolder) -> Path:
         outcomes=list(zip(OUTCOMES, summary.count, summary.weight, strict=True)),
         estimators=sorted(run.estimates.estimates.items(), key=lambda item: item[0] != run.estimates.headline),
         warnings=[*answer.warnings, *uncovered(run, summary)], diagnostics=diagnostics(run),
-        settings=dump_campaign(run.campaign), folder=run.typed,
+        settings=dump_campaign(run.campaign), folder=typed(run.path),
     )  # fmt: skip
 
 
@@ -50,7 +50,7 @@ def write_hours(folder: Path, content: dict[str, Any]) -> Path:
         content=content, answer=several.answer_of_sum(content, readings=True),
         rows=[(row, content["families"][row[0]]) for row in several.family_rows(content)],
         exposures=several.exposures(content), called=several.called,
-        moved=_sensitivity(folder, tests_of_sum(content), str(folder)),
+        moved=_sensitivity(folder, tests_of_sum(content), str(folder)), folder=typed(folder),
     )  # fmt: skip
 
 
@@ -108,7 +108,7 @@ def _plots(run: RunFolder, summary: RunSummary) -> list[Plot]:
         severity_plot(run.estimates),
         where_plot(run, summary),
         None if run.shells is None else shells_plot(run.shells),
-        _sensitivity(run.path, run.manifest["campaign_hash"], run.typed),
+        _sensitivity(run.path, run.manifest["campaign_hash"], typed(run.path)),
         convergence_plot(run),
     ]
     return [plot for plot in plots if plot is not None]
@@ -144,7 +144,7 @@ def uncovered(run: RunFolder, summary: RunSummary) -> list[str]:
     if n_estimated in (n_tests, n_tests - int(summary.count[FAILED])):
         return []
     found = f"the estimates cover {count(n_estimated)} tests but the records hold {count(n_tests)}"
-    return [f"{found}: run harness estimate {run.typed} --write"]
+    return [f"{found}: run harness estimate {typed(run.path)} --write"]
 
 
 def diagnostics(run: RunFolder) -> list[tuple[str, Any]]:

@@ -139,7 +139,7 @@ def shells_plot(found: ShownShells) -> Plot:
             left.add("text", "muted", 0.1 * limit, row - 0.26, label=f"not tested: up to {number(shell.high)}")
     right.add("boxes", "grey", 0.0 * rows, half_widths, rows - 0.3, rows + 0.3, opacity=0.85)
     for row, width in enumerate(half_widths.tolist()):
-        text = share(found.share_of_uncertainty(width), least=0.001)
+        text = share(found.share_of_uncertainty(width), least=0.001) + " →" * (width > widest)
         right.add("text", "muted", min(width, widest / 1.3), row, label=text)
     if (boundary := found.within.n_shells - 0.5) < len(shells) - 0.5:
         label = "outside ↓"  # the boundary is the row above

@@ -87,17 +87,17 @@ class RunFolder:
         """What scenes need of crashes, in index order."""
         return self.tests.crashes.filter(pc.field("episode").isin(sorted(episodes)))
 
-    @property
-    def typed(self) -> str:
-        """The folder as commands on the page name it: relative to the working directory, or its bare name.
 
-        The bare name stands for a folder that is not below it. An absolute path would say where somebody keeps their
-        files to everybody whom the page is mailed to.
-        """
-        here, resolved = Path.cwd(), self.path.resolve()
-        unlinked = Path(os.path.abspath(self.path))  # noqa: PTH100 - resolve() would leave by a link what was typed below `here`
-        below = (path.relative_to(here) for path in (unlinked, resolved) if path.is_relative_to(here))
-        return shlex.quote(next(below, Path(resolved.name)).as_posix())
+def typed(path: Path) -> str:
+    """A folder as commands on its page name it: relative to the working directory, or its bare name.
+
+    The bare name stands for a folder that is not below it. An absolute path would say where somebody keeps their files
+    to everybody whom the page is mailed to.
+    """
+    here, resolved = Path.cwd(), path.resolve()
+    unlinked = Path(os.path.abspath(path))  # noqa: PTH100 - resolve() would leave by a link what was typed below `here`
+    below = (each.relative_to(here) for each in (unlinked, resolved) if each.is_relative_to(here))
+    return shlex.quote(next(below, Path(resolved.name)).as_posix())
 
 
 def read_run_folder(path: Path, told: dict[str, Any] | None = None) -> RunFolder:
