@@ -171,8 +171,9 @@ def _note_other_stop(folder: Path, campaign: Campaign) -> None:
         held = harness.load_campaign(folder / "campaign.yaml", check_files=False)
         now, before = (dict(leaves(each.model_dump(include={"stop", "accept"}))) for each in (campaign, held))
         for key in {**before, **now}:
-            if (value := now.get(key)) != (was := before.get(key)):
-                say(f"note: {key} is {words(value)} now; before it was {words(was)}", err=True)
+            if now.get(key) != before.get(key):
+                is_now, was = ("null" if of.get(key) is None else words(of[key]) for of in (now, before))
+                say(f"note: {key} is {is_now} now; before it was {was}", err=True)
 
 
 @contextmanager
