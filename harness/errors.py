@@ -78,6 +78,16 @@ class HarnessError(Exception):
         return "".join((f"{self.where}: found {self.found}; expected {self.expected}. {self.mend}", *of_each))
 
 
+@contextmanager
+def told_of(whom: str) -> Iterator[None]:
+    """Let an error say of which of several vehicles or scenarios it is."""
+    try:
+        yield
+    except HarnessError as error:
+        error.where += f" ({whom})" if whom else ""
+        raise
+
+
 class CampaignError(HarnessError):
     """The campaign file, or a file that it names, is wrong."""
 

@@ -189,6 +189,7 @@ def sensitivity(folder: Path, *, ranges: dict[str, tuple[float, float]], as_json
     ends = [(bar, (*bar["rate"], *bar["ratio"])) for bar in content["bars"]]
     bars = [_bar(bar) for bar, times in ends if any(t is None or abs(t - 1.0) >= LEAST_MOVE for t in times)]
     n_still = len(content["bars"]) - len(bars)
+    still = "1 more number moves" if n_still == 1 else f"{n_still} more numbers move"
     if not any(bar["remark"] for bar in bars):
         bars = [{key: value for key, value in bar.items() if key != "remark"} for bar in bars]
     from harness.families import families
@@ -197,7 +198,7 @@ def sensitivity(folder: Path, *, ranges: dict[str, tuple[float, float]], as_json
     usual = "the default traffic, " * (traffic in [family.default_parameters for family in families().values()])
     print_table(f"What moves the answer: {usual}{traffic}", bars)
     say(
-        *([f"{n_still} more numbers move neither by {share(LEAST_MOVE)}."] if n_still else ()),
+        *([f"{still} neither by {share(LEAST_MOVE)}."] if n_still else ()),
         "Under 'rate' and 'ratio' (to the competent driver) the left value is by how much they are multiplied with the "
         "number at its lower end, the right one at its upper end; '–': these tests do not tell it.",
         "This assumes that the same share of each shell's events end in a crash; 'error' is by how much that is wrong "
@@ -241,7 +242,8 @@ def report(folder: Path) -> None:
 @click.argument("episode", metavar="TEST", type=click.IntRange(min=0))
 @click.option(
     "--out", "files", metavar="FILE", type=FILE, multiple=True,
-    help="Write the motion. The suffix says how: .html, a page that plays it; .csv, a row for each vehicle and step; "
+    help="Write the motion. The suffix says how: .html, a page that plays it; .csv, a row for each vehicle and step "
+    "(time_s, vehicle, lane, x_m, v_mps, a_mps2, lateral_m); "
     ".xosc, OpenSCENARIO XML 1.2 and its road (.xodr; extra 'export'); .xml, SUMO's floating car data; "
     ".sumocfg, as --sumo. May be given several times.",
 )  # fmt: skip

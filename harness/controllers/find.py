@@ -8,6 +8,7 @@ import os
 import re
 import sys
 from collections.abc import Callable, Iterable
+from contextlib import suppress
 from copy import deepcopy
 from functools import cache, partial
 from importlib.util import module_from_spec, spec_from_file_location
@@ -46,7 +47,7 @@ class AvEndedProcessError(HarnessError):
 
 
 def own_code(
-    name: str, where: str = "av.controller", what: str = "a controller (see docs/controllers.md)"
+    name: str, where: str = "av.controller", what: str = "a class with step(self, seen), or a function step(seen)"
 ) -> Callable[..., Any]:
     """The class, or function, that a name stands for: ``my_av.py:Class`` or ``package.module:Class``.
 
@@ -235,7 +236,8 @@ def _is_controller(made: Any) -> bool:
 def _require_controller(made: Any, name: str) -> None:
     if not _is_controller(made):
         expected = "a function step(seen), or a class with step (per vehicle) or step_batch (arrays)"
-        mend = "See docs/controllers.md. A function without arguments says what it makes: `def make() -> MyAv:`."
+        mend = "Write def step(self, seen): return 0.0, say: m/s², every 0.1 s (docs/controllers.md)."
+        mend = "A function without arguments says what it makes: `def make() -> MyAv:`." if made is None else mend
         mend = "docs/policies.md has an adapter for what has predict(obs)." if hasattr(made, "predict") else mend
         meant = did_you_mean("step", [each for each in dir(made) if each[0] != "_"])
         raise CampaignError("av.controller", f"{name} without step", expected, meant or mend)
@@ -248,6 +250,14 @@ def _made(make: Callable[[], Any], name: str, guard: Guard) -> Any:
     if wrong is not None:
         raise _not_made(name, wrong)
     _require_controller(controller, name)
+    method = "step_batch" if _is_batch(controller) else "step"
+    with suppress(ValueError):  # one in C may have no signature
+        takes = signature(getattr(controller, method))
+        try:
+            takes.bind(None)
+        except TypeError as error:
+            found, expected = f"{name}, whose {method} takes {takes} ({error})", f"{method}(self, seen)"
+            raise CampaignError("av.controller", found, expected, f"Write def {expected}: in it.") from error
     return controller
 
 

@@ -9,7 +9,7 @@ are: what is counted and what assumed is said beside the answer, and by what the
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from itertools import product
 from typing import Any, NamedTuple
 
@@ -146,8 +146,10 @@ class PerHour:
         from_pool = level.z * math.sqrt(variance)
         return RateLimits(rate, max(low, 0.0), high, from_pool, from_pool)
 
-    def limits_with_counts(self, level: Level) -> tuple[float, float]:
-        """Limits of the rate where counted exposures are as uncertain as their counts.
+    def limits_with_counts(
+        self, level: Level, limits: Callable[[PerHour, Level], tuple[float, float]] = lambda of, at: of.limits(at)[1:3]
+    ) -> tuple[float, float]:
+        """Limits of the rate, or of something else, where counted exposures are as uncertain as their counts.
 
         Of k events an exposure x times the counted one costs k (x - 1 - ln x) of the threshold, the Poisson law's
         likelihood ratio: a limit is the outermost over x of that with what is left of it. The threshold is that of few
@@ -169,11 +171,11 @@ class PerHour:
             exposures = {
                 of.family: of.exposure.per_hour * own for of, own in zip(self.families, x.tolist(), strict=True)
             }
-            found = self.with_exposures(exposures).limits(left)
-            return found.low if side < 0 else -found.high
+            low, high = limits(self.with_exposures(exposures), left)
+            return low if side < 0 else -high
 
         if not free.size:
-            return self.limits(level)[1:3]
+            return limits(self, level)
         scale = level.threshold / np.array(counted)[free]
         farthest = np.sqrt(2.0 * scale) + scale  # beyond, x alone costs more than the threshold
         grid = [farthest * at for at in product(np.linspace(-1.0, 1.0, _GRID), repeat=free.size)]
@@ -247,7 +249,8 @@ class PerHour:
         per_km = 1e6 / (3.6 * speed_mps)  # of a million km, per hour
         names = dict.fromkeys(name for of in self.families for name in of.seen.design.readings) or [""]
         beside, *readings = (
-            PerHour([of._replace(reading=name) for of in self.families])._beside(name, level) for name in names
+            PerHour([of._replace(reading=name) for of in self.families])._beside(name, level, counts=counts)
+            for name in names
         )
         return {
             "confidence": confidence, "n_episodes": n, "n_crashes": n_crashes, "n_failed": n_failed,
@@ -258,8 +261,10 @@ class PerHour:
             "families": {of.family: found for of, found in zip(self.families, self._families(confidence), strict=True)},
         }  # fmt: skip
 
-    def _beside(self, reference: str, level: Level) -> dict[str, Any]:
+    def _beside(self, reference: str, level: Level, *, counts: bool) -> dict[str, Any]:
         ratio, low, high = self.ratio(level)
+        if counts and math.isfinite(high):
+            low, high = self.limits_with_counts(level, lambda of, at: of.ratio(at)[1:])
         return {
             "reference": reference, "rate_per_hour": self.reference_rate,
             "ratio": ratio, "ratio_low": low, "ratio_high": high, "over_assumed": self.over_assumed(),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import xml.etree.ElementTree as ET
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -67,7 +68,9 @@ def write_junit(path: Path, suite: str, case: Case, attachments: Sequence[Path])
     told = [case.message] if case.outcome == "passed" else []
     if not told:
         rows = case.message.replace("\n    ", " ").splitlines()[:2] or [""]  # those too long go on below
-        ET.SubElement(element, case.outcome, message=case.verdict or " ".join(rows[-1].split())).text = case.message
+        what, *parts = re.split(" {2,}", rows[-1].strip())  # cells of a row
+        told_as = case.verdict or ": ".join(filter(None, [what, ", ".join(parts)]))
+        ET.SubElement(element, case.outcome, message=told_as).text = case.message
     ET.SubElement(element, "system-out").text = "\n".join([*told, *attached, ""])
     ET.indent(root)
     text = printable(ET.tostring(root, encoding="unicode", xml_declaration=True))

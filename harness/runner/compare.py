@@ -19,7 +19,7 @@ from harness.campaign.campaign import Campaign
 from harness.campaign.files import campaign_of
 from harness.campaign.sections import MOST_EVENTS
 from harness.campaign.vehicle import Limits
-from harness.errors import CampaignError
+from harness.errors import CampaignError, told_of
 from harness.estimators.answer import ended_by
 from harness.estimators.estimate import finite_json
 from harness.estimators.likelihood import Level
@@ -150,7 +150,11 @@ def compare_campaigns(
         require_no_other(out, [*(a.scenarios or SIDES), COMPARISON])
     ready: dict[Path, Both] = {}
     for name, folder in folders.items():
-        of_a, of_b = (require_ready(of.of_family(name) if of.scenarios else of, "compare") for of in (a, b))
+        each_ready = []
+        for side, whole in zip("AB", (a, b), strict=True):
+            with told_of(f"{side}, {name}" if a.scenarios else side):
+                each_ready.append(require_ready(whole.of_family(name) if whole.scenarios else whole, "compare"))
+        of_a, of_b = each_ready
         require_comparable(of_a.campaign, of_b.campaign)
         require_same_shells((of_a, of_b), stored)
         ready[out / folder] = of_a, of_b

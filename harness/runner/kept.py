@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 import platform
+import re
 import time
 import zlib
 from collections import Counter
@@ -276,6 +277,8 @@ def require_few_failed(
         few = f"; or go on (`run`: --resume) with --set {SHARE}={enough:g}" if enough < 0.2 else ""  # [assumed]
         mend = f"Fix the AV (`harness av-check` looks at it in seconds): a corrected one needs a new --out{few}."
         found, expected = f"{causes.total()} of {n} {what} failed{cause}", f"a share of at most {most:g}"
+        if re.search(r"\b(nan|infinity|inf)\b", cause, re.IGNORECASE):
+            mend = f"With nobody ahead gap_m is infinite and lead_speed_mps NaN (docs/controllers.md). {mend}"
         mend += f" All causes are in the column 'failure' of {where}."
         raise TooManyFailedError(SHARE, found, expected, mend)
 

@@ -20,7 +20,7 @@ import numpy as np
 from harness.arguments import AtLeastOne, checked
 from harness.campaign.campaign import Campaign
 from harness.campaign.files import campaign_of, dump_campaign
-from harness.errors import CampaignError, RunFolderError
+from harness.errors import CampaignError, RunFolderError, told_of
 from harness.estimators.answer import Estimates, ended_by
 from harness.estimators.estimate import finite_json
 from harness.estimators.per_hour import OfFamily, PerHour, own_exposure
@@ -115,7 +115,10 @@ class Hours(ShownInPython):
 def run_families(campaign: Campaign, out: Path, *, workers: int | None, resume: bool, progress: Progress) -> Hours:
     """Run the scenarios of a campaign until their sum is known; see `harness.run`."""
     names, began = campaign.scenarios or [], time.monotonic()
-    ready = {name: require_ready(campaign.of_family(name)) for name in names}
+    ready = {}
+    for name in names:
+        with told_of(name):
+            ready[name] = require_ready(campaign.of_family(name))
     require_same_driver(campaign, ready)
     rule = RoundRule(campaign)
     with ExitStack() as held:

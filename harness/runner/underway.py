@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import pyarrow as pa
 
-from harness.errors import EXIT_BUDGET_SPENT, EXIT_DONE, EXIT_REFUTED, CampaignError
+from harness.errors import EXIT_BUDGET_SPENT, EXIT_DONE, EXIT_REFUTED, CampaignError, told_of
 from harness.estimators.answer import (
     STORED_ESTIMATES,
     before_event,
@@ -106,6 +106,8 @@ class Underway:
     run: Run
     crew: Workers
     progress: Progress
+    whom: str = ""
+    """Which vehicle and scenario it is of, where there are others beside it."""
 
     @property
     def prescribed(self) -> PrescribedEpisodes:
@@ -164,14 +166,15 @@ class Underway:
 
     def drive(self, requests: Iterable[ShardRequest], rule: Rule) -> Iterator[ShardResult]:
         """Shards in order, each part of the run by the time that it is handed out."""
-        for shard in self.crew.run(iter(requests), self.run.known):
-            with uninterrupted():
-                self.run = self.run.with_shard(shard)
-            n_new = max(self.run.n_episodes - self.run.earlier.n_episodes, 0)
-            self.progress.advance(min(n_new, shard.request.n_episodes), crashes=int(shard.block.crash.sum()))
-            asked = None if self.run.resolved.campaign.accept else rule.target
-            self.progress.status(rhw=rule.look.rhw, asked=asked or math.inf)
-            yield shard
+        with told_of(self.whom):
+            for shard in self.crew.run(iter(requests), self.run.known):
+                with uninterrupted():
+                    self.run = self.run.with_shard(shard)
+                n_new = max(self.run.n_episodes - self.run.earlier.n_episodes, 0)
+                self.progress.advance(min(n_new, shard.request.n_episodes), crashes=int(shard.block.crash.sum()))
+                asked = None if self.run.resolved.campaign.accept else rule.target
+                self.progress.status(rhw=rule.look.rhw, asked=asked or math.inf)
+                yield shard
 
     def drive_added(self, tested: IntArray, added: IntArray, rule: Rule) -> Iterator[ShardResult]:
         """The same of ``added`` tests per stratum, (S,), of which so many are ``tested``."""
@@ -186,8 +189,9 @@ class Underway:
             found = f"{campaign.stop.episodes}, spent before a test of {campaign.scenario}"
             mend = "Raise it and go on with --resume, or lower testing.shells.first_tests."
             raise CampaignError("stop.episodes", found, "some tests of each scenario", mend)
-        self.run.require_few_failed()
-        self.run.require_no_fewer()
+        with told_of(self.whom):
+            self.run.require_few_failed()
+            self.run.require_no_fewer()
 
     def doubted(self) -> tuple[int, int]:
         """What keeps a limit from being accepted, by number of tests: see `Decision`."""
@@ -251,19 +255,22 @@ def begun(places: Places, workers: int | None, progress: Progress) -> Iterator[l
 
     The folders can be read wherever it is interrupted. Workers end with it; those of several runs take turns.
     """
-    several = len({resolved.campaign.scenario for resolved, _ in places.values()}) > 1
+    n_scenarios = len({resolved.campaign.scenario for resolved, _ in places.values()})
     runs: list[Underway] = []
     with ExitStack() as working:
         try:
             for folder, (resolved, earlier) in places.items():
-                progress.remark = f" ({resolved.campaign.scenario.replace('_', ' ')})" if several else ""
-                crew = working.enter_context(closing(workers_of(resolved, workers, n_runs=len(places))))
-                began = time.monotonic()
-                remove_unfinished(folder.rglob(".*.part"))
-                source = prepare(resolved, progress)
-                run = take_over(folder, resolved, source, earlier, began, workers=crew.n_workers)
-                runs.append(Underway(run, crew, progress))
-                runs[-1].drive_before_tests()
+                scenario = resolved.campaign.scenario if n_scenarios > 1 else ""
+                progress.remark = f" ({scenario.replace('_', ' ')})" if scenario else ""
+                whom = ", ".join(filter(None, (folder.name.upper() * (len(places) > n_scenarios), scenario)))
+                with told_of(whom):
+                    crew = working.enter_context(closing(workers_of(resolved, workers, n_runs=len(places))))
+                    began = time.monotonic()
+                    remove_unfinished(folder.rglob(".*.part"))
+                    source = prepare(resolved, progress)
+                    run = take_over(folder, resolved, source, earlier, began, workers=crew.n_workers)
+                    runs.append(Underway(run, crew, progress, whom))
+                    runs[-1].drive_before_tests()
             progress.remark = ""
             yield runs
         except BaseException:

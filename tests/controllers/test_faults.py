@@ -7,6 +7,7 @@ import sys
 from collections import Counter
 from contextlib import nullcontext
 from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -14,13 +15,14 @@ import pytest
 from benchmarks.kills import orphans
 from harness.campaign.campaign import Campaign
 from harness.campaign.vehicle import Limits
-from harness.cli import main
+from harness.cli import cli, main
 from harness.controllers.find import build_host
 from harness.controllers.hosts import Guard, _numbers
 from harness.controllers.process_state import OtherModules
-from harness.errors import EXIT_BAD_INPUT, EXIT_DONE, EXIT_TOO_MANY_FAILED, TooManyFailedError
+from harness.errors import EXIT_BAD_INPUT, EXIT_DONE, EXIT_TOO_MANY_FAILED, CampaignError, TooManyFailedError
 from harness.printed import PRINTED
 from harness.runner.kept import require_few_failed
+from harness.runner.underway import Underway
 from harness.runner.workers import LocalWorkers
 from tests.controllers.misbehaving import Learned
 from tests.in_process import controllers_here, one_process, without_page
@@ -179,6 +181,20 @@ def test_to_go_on_is_offered_where_few_tests_failed(n, offered):
         require_few_failed(Counter({"step: raises": 5}), n, Campaign(name="x"))
     assert ("--set run.max_failed_share=" in caught.value.mend) == offered
     assert "needs a new --out" in caught.value.mend
+    with pytest.raises(TooManyFailedError) as caught:
+        require_few_failed(Counter({"step: returned nan, expected a finite acceleration": 5}), n, Campaign(name="x"))
+    assert caught.value.mend.startswith("With nobody ahead gap_m is infinite and lead_speed_mps NaN")
+
+
+def test_an_error_while_several_are_driven_says_of_which():
+    crew = Mock(run=Mock(side_effect=TooManyFailedError("x", "y", "z", "w")))
+    with pytest.raises(TooManyFailedError) as caught:
+        next(Underway(Mock(), crew, Mock(), "B, lead_brakes").drive([], Mock()))
+    assert caught.value.where == "x (B, lead_brakes)"
+    asked = "compare", "idm", "tests.controllers.misbehaving:OnlyStepp", "--scenario", "all", "--out", "nowhere"
+    with pytest.raises(CampaignError) as caught:
+        cli.main(asked, standalone_mode=False)
+    assert caught.value.where == "av.controller (B, cut_in)"
 
 
 SHORT_MADE = ", limits: {construction_time_s: 0.2}"
@@ -202,6 +218,7 @@ REFUSED = [
     ),
     (_of("RaisesForOtherNames"), "av.controller", "cannot be made: RuntimeError: step_batch (misbehaving.py:"),
     (_of("says_nothing"), "av.controller", "without step"),
+    (_of("StepOfNothing"), "av.controller", "fix:      Write def step(self, seen): in it.\n"),
     (POPEN, "av.controller", "Popen without step"),
 ]
 

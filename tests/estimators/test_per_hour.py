@@ -218,6 +218,8 @@ def test_few_counted_events_are_in_the_interval_on_request():
     assert wider[0] <= plain.low < plain.high <= wider[1]
     assumed = PerHour(THREE[1:])
     assert assumed.limits_with_counts(LEVEL) == assumed.limits(LEVEL)[1:3]
+    own, wide = (free.to_json(0.9, 32.0, counts=counts)["beside"] for counts in (False, True))
+    assert wide["ratio_low"] < own["ratio_low"] < own["ratio_high"] < wide["ratio_high"]
 
 
 def test_counted_exposures_move_the_limit_where_another_family_bounds_it_at_their_counts():

@@ -138,14 +138,16 @@ def test_a_refuted_assumption_fails_and_no_gate_passes_because_nothing_was_asked
 
 
 def test_the_verdict_is_whole_and_of_a_comparison_its_own(tmp_path):
-    """A row too long for a terminal goes on below."""
+    """A row too long for a terminal goes on below; its cells are a sentence."""
     answer = (
         "idm · 9 tests\n  UNDECIDED  0 is the limit;\n    it may be 1.12 × 10⁻⁷ to 1.09\n    × 10⁻⁶\n  crash rate  1"
     )
     decision = {"margin": 0.1, "verdict": "refuted", "confidence": 0.95}
     worse = difference_case({"decision": decision}, "B is more …\n  A a  1", 5)
     told = statement_case(content(), answer, "assumption_free", 4), worse
-    for case, verdict in zip(told, ("UNDECIDED 0 is the limit; it may be 1.12 × 10⁻⁷ to 1.09 × 10⁻⁶", ""), strict=True):
+    for case, verdict in zip(
+        told, ("UNDECIDED: 0 is the limit; it may be 1.12 × 10⁻⁷ to 1.09 × 10⁻⁶", ""), strict=True
+    ):
         write_junit(tmp_path / "gate.xml", "x", case, [])
         ((asked,),) = JUnitXml.fromfile(str(tmp_path / "gate.xml"))
         assert asked.result[0].message == (verdict or "B is more than 10 % worse than A")
