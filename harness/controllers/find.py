@@ -62,9 +62,8 @@ def own_code(
     except (Exception, SystemExit) as error:
         cause = f"{name}, whose module cannot be imported ({cause_of(error)})"
         meant = did_you_mean(module_name, [file.stem for file in Path.cwd().glob("*.py")])
-        mend = "Name its file, my_av.py:Class, or install it beside the harness."
-        if is_file:
-            mend = "Fix the module." if Path(module_name).exists() else "Put it back, or name another."
+        of_file = "Fix the module." if Path(module_name).exists() else "Put it back, or name another."
+        mend = of_file if is_file else "Name its file, my_av.py:Class, or install it beside the harness."
         raise CampaignError(where, cause, "a Python module that can be imported", meant or mend) from error
     found = getattr(module, class_name, None)
     if not callable(found):
