@@ -136,7 +136,9 @@ def nearest(word: str, words: Sequence[str]) -> str:
     word = re.sub("max_(braking|decel|deceleration)(?=_|$)", "min_acceleration", word)
     flat = {each.lower().replace("-", "_"): each for each in reversed(words)}
     cutoff = 0.75 if len(word) > 4 else 0.6  # of three letters a wrong one leaves 0.67
-    close = difflib.get_close_matches(word.lower().replace("-", "_"), flat, 1, cutoff)
+    word = word.lower().replace("-", "_")
+    without_unit = [each for each in flat if each.startswith(f"{word}_")]  # speed of speed_mps
+    close = difflib.get_close_matches(word, flat, 1, cutoff) or without_unit
     return flat[close[0]] if close else ""
 
 

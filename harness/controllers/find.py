@@ -32,7 +32,7 @@ from harness.controllers.hosts import BatchHost, BeforeTest, ControllerHost, Gua
 from harness.controllers.traci_style import StepListenerController
 from harness.errors import EXIT_TOO_MANY_FAILED, CampaignError, HarnessError
 from harness.files import real_path
-from harness.problems import did_you_mean
+from harness.problems import did_you_mean, nearest
 from harness.processes import Child, WorkerDeath, first_to_answer, tell
 from harness.vehicles.kinematics import STEP_S
 
@@ -238,8 +238,9 @@ def _require_controller(made: Any, name: str) -> None:
         mend = "Write def step(self, seen): return 0.0, say: m/s², every 0.1 s (docs/controllers.md)."
         mend = "A function without arguments says what it makes: `def make() -> MyAv:`." if made is None else mend
         mend = "docs/policies.md has an adapter for what has predict(obs)." if hasattr(made, "predict") else mend
-        meant = did_you_mean("step", [each for each in dir(made) if each[0] != "_"])
-        raise CampaignError("av.controller", f"{name} without step", expected, meant or mend)
+        if meant := nearest("step", [each for each in dir(made) if each[0] != "_"]):
+            mend = f"Rename {meant} to step."
+        raise CampaignError("av.controller", f"{name} without step", expected, mend)
 
 
 def _made(make: Callable[[], Any], name: str, guard: Guard) -> Any:

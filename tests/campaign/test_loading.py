@@ -33,6 +33,7 @@ def load(tmp_path):
 
 MISTAKES = (
     ("testin:\n  epsilon: 0.2", "testin", 2, "Did you mean 'testing'?"),
+    ("av:\n  reaction: {delay: 0.5}", "av.reaction.delay", 3, "Did you mean 'delay_s'?"),  # its unit is left out
     ("epsilon: 0.2", "epsilon", 2, "belongs under testing"),
     ("testing: 5", "testing", 2, "a section with keys such as method"),
     ("stop: 100", "stop", 2, "Write stop: {episodes: 100}."),

@@ -297,6 +297,11 @@ class Batch:
     def close(self): ...
 
 
+class StepMisspelt:
+    def stp(self, seen):
+        return 0.0
+
+
 class StepOfNothing:
     """Whose step takes no observation."""
 
