@@ -93,6 +93,10 @@ class Campaign(Section):
             expected = f"one weight for each surrogate: {listed(self.surrogates)}"
             mend = "Name the surrogates exactly, or leave alpha out for equal weights."
             raise broken_rule("testing.alpha", f"weights for {listed(alpha)}", expected, mend)
+        for name in set(self.exposure) - set(self.scenarios or self.exposure):
+            tested = self.scenarios or ()
+            mend = did_you_mean(name, tested) or "Name it among scenarios, or delete it."
+            raise broken_rule(f"exposure.{name}", f"'{name}'", f"a scenario that is tested: {listed(tested)}", mend)
         if (words := refusal(self)) is not None:
             raise broken_rule(*words)
         return self
@@ -231,8 +235,8 @@ REFUSED = (
         "Delete the key, or write one scenario.",
     ),
     Combination(
-        "exposure", lambda c, _: bool(set(c.exposure) - set(c.scenarios or ())),
-        "{exposure}, with scenarios: {scenarios}", "events per hour of those that are tested",
+        "exposure", lambda c, _: bool(c.exposure) and c.scenarios is None,
+        "{exposure}, with one scenario", "events per hour of those that are tested",
         "Add --scenario all (scenarios: [cut_in, lead_brakes, cut_out]), or delete it: one alone has no rate per hour.",
     ),
     Combination(

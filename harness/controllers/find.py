@@ -308,11 +308,16 @@ def script_step_s(av: AutomatedVehicle) -> float:
     """How often a TraCI script is asked (s), as it asks for when it is tried; 0 of any other controller."""
     if not is_script(name := str(av.controller)):
         return 0.0
-    from harness.controllers.traci_ego import steps_asked  # noqa: PLC0415 - few campaigns have one
+    from harness.controllers.traci_ego import asked_for  # noqa: PLC0415 - few campaigns have one
 
-    if not (every := run_apart(av, steps_asked, av)):
+    (every, hardest), bound = run_apart(av, asked_for, av), av.traci_style.decel_mps2
+    file = real_path(file_and_function(name)[0]).name
+    if not every:
         told = "names no --step-length, nor does its .sumocfg: it is asked every 0.1 s, where SUMO would ask every 1 s"
-        _tell_once(f"{real_path(file_and_function(name)[0]).name} {told}")
+        _tell_once(f"{file} {told}")
+    if hardest > bound and "decel_mps2" not in av.traci_style.model_fields_set:
+        told = f"asks for harder braking than {bound:g} m/s², the decel of SUMO's default type, and gets that"
+        _tell_once(f"{file} {told}; of another type: --set av.traci_style.decel_mps2=8, say")
     return STEP_S * (every or 1)
 
 

@@ -15,7 +15,7 @@ from harness.campaign.vehicle import AutomatedVehicle
 from harness.controllers.hosts import Guard, cause_of
 from harness.controllers.protocol import EpisodeStart, Neighbour, Observation
 from harness.controllers.traci_script import ScriptController, TraciScript
-from harness.controllers.traci_vehicle import VEH_ID, SeenVehicle, VehicleDomain
+from harness.controllers.traci_vehicle import DECEL, VEH_ID, SeenVehicle, VehicleDomain
 from harness.errors import CampaignError
 from harness.vehicles.kinematics import STEP_S, VEHICLE_LENGTH_M
 
@@ -40,7 +40,7 @@ def script_maker(av: AutomatedVehicle, guard: Guard) -> Callable[[], ScriptContr
     if (ego := style.ego) is None:
         with guard:
             answer, late = guard.call(_found, script, makes=True)
-        ego, wrong = answer or (None, f"{FAILS}: {late}")
+        ego, wrong, _ = answer or (None, f"{FAILS}: {late}", 0.0)
     else:
         wrong = f"calls its vehicle {ego}, as one of the others is called" if ego in OTHERS else ""
     if wrong or ego is None:
@@ -92,13 +92,19 @@ class _Anybody(dict[str, SeenVehicle]):
 
 
 class _Tried(VehicleDomain):
-    """Notes which vehicles a script commands."""
+    """Notes which vehicles a script commands, and the ``hardest`` braking (m/s²) that its vehicle's type bounds."""
 
     def __init__(self, ego: str) -> None:
         super().__init__(SPEED_MPS, ego)
-        self.commanded = dict[str, None]()
+        self.commanded, self.hardest = dict[str, None](), 0.0
         if isinstance(ego, _AnyName):
             self._seen = _Anybody(self._seen, ego)
+
+    def next_acceleration(self) -> float:
+        acceleration = super().next_acceleration()
+        if self._speed_mode & DECEL and math.isinf(self._decel):  # no bound of its own
+            self.hardest = max(self.hardest, -acceleration)
+        return acceleration
 
     def _require_own(self, vehID: str, name: str, why: str = "") -> None:  # noqa: ARG002
         self._of(vehID)
@@ -106,43 +112,56 @@ class _Tried(VehicleDomain):
             self.commanded[vehID] = None
 
 
-def _found(script: TraciScript) -> tuple[str | None, str]:
-    """Name of the one vehicle that a script commands, or what is wrong with it.
+def _found(script: TraciScript) -> tuple[str | None, str, float]:
+    """Name of the one vehicle that a script commands, or what is wrong with it; and its hardest braking (`_Tried`).
 
     Names are first taken as they come, each for the AV; those that came are then tried, one after the other.
     """
     anybody = _AnyName(VEH_ID)
-    commanded, *wrong = _commanded(script, anybody)
+    tried, *wrong = _commanded(script, anybody)
+    commanded = list(tried.commanded)
     named = [name for name in commanded if name is not anybody]
     for name in dict.fromkeys((named + list(anybody.asked)) or [VEH_ID] * bool(commanded)):
         if len(named) < 2:
-            named, failed = _commanded(script, name)
+            tried, failed = _commanded(script, name)
+            named = list(tried.commanded)
             wrong.insert(-1, failed)
         if len(named) > 1:
-            return None, f"commands {' and '.join(named)}"
+            return None, f"commands {' and '.join(named)}", 0.0
         if named == [name] and not failed:
-            return name, ""
-    return None, f"{FAILS}: {why}" if (why := next(filter(None, wrong), "")) else "commands no vehicle before a cut-in"
+            return name, "", tried.hardest
+    why = next(filter(None, wrong), "")
+    return None, f"{FAILS}: {why}" if why else "commands no vehicle before a cut-in", 0.0
 
 
-def _commanded(script: TraciScript, ego: str) -> tuple[list[str], str]:
-    """Names of the vehicles that a script commands when a car cuts in before it; and what it raises."""
+def _commanded(script: TraciScript, ego: str) -> tuple[_Tried, str]:
+    """What a script does when a car cuts in before it; and what it raises."""
     tried = _Tried(ego)
     try:
         with closing(ScriptController(script, lambda *_: tried)) as controller:
             _drive(controller)
     except (Exception, SystemExit) as error:  # noqa: BLE001 - whatever a user's code raises
-        return list(tried.commanded), cause_of(error)
-    return list(tried.commanded), ""
+        return tried, cause_of(error)
+    return tried, ""
 
 
-def steps_asked(av: AutomatedVehicle) -> int:
-    """Of how many of the harness's steps one of a script's is, as it asks for before its first; 0 where it does not."""
-    tried = _Tried(av.traci_style.ego or _AnyName(VEH_ID))
-    controller = ScriptController(TraciScript(str(av.controller), dict(av.parameters)), lambda *_: tried)
+def asked_for(av: AutomatedVehicle) -> tuple[int, float]:
+    """Of how many of the harness's steps one of a script's is, as it asks for before its first; 0 where it does not.
+
+    And the hardest braking (m/s²) that it asks for before a cut-in, as far as only its vehicle's type bounds that.
+    """
+    script, ego = TraciScript(str(av.controller), dict(av.parameters)), av.traci_style.ego
+    tried = _Tried(ego or _AnyName(VEH_ID))
+    controller = ScriptController(script, lambda *_: tried)
     with (guard := Guard(av.limits)):
         guard.call(_drive, controller, 1, makes=True)
-    return controller.traci.every
+        if ego is None:
+            found, _ = guard.call(_found, script, makes=True)
+            hardest = found[-1] if found else 0.0
+        else:
+            found, _ = guard.call(_commanded, script, ego, makes=True)
+            hardest = found[0].hardest if found else 0.0
+    return controller.traci.every, hardest
 
 
 def _drive(controller: ScriptController, n_steps: int = 100) -> None:

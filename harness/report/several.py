@@ -110,12 +110,22 @@ def sum_warnings(content: Mapping[str, Any]) -> Iterator[str]:
     asked = decision["limit"] if decision and decision["driver"] and decision["verdict"] != "undecided" else math.nan
     if ends is not None and ends[0] <= asked <= ends[1]:
         yield f"assumed numbers may turn this verdict: × {ratio(ends[0])} to {ratio(ends[1])} over their ranges"
+    for each in content["readings"]:
+        if _side(each) != _side(content["beside"]):
+            yield f"beside {each['reference']}, another reading of UN R157, it is × {' ('.join(ratio_words(each))})"
     for name, of in content["families"].items():
         told = list(words.warnings_of(name, {**of, "rate": of["rate_per_hour"]}, " per hour"))
         if (left := of.get("assumed")) and (found := AssumedOfRate(**left)).no_lower_limit:
             most = found.most * (of["ci_high"] if of["n_crashes"] else of["upper_bound"])
             told.append(f"{words.unseen_words(found.where)}, here {number(most)} per hour")
         yield from (f"{called(name)}: {text}" for text in told)
+
+
+def _side(of: Mapping[str, Any]) -> str:
+    """On which side of a driver a vehicle is, if on one."""
+    if of["ratio"] is None:
+        return ""
+    return "more" if of["ratio_low"] > 1.0 else "less" if (of["ratio_high"] or math.inf) < 1.0 else ""
 
 
 def exposures(content: Mapping[str, Any]) -> str:

@@ -70,6 +70,7 @@ BROKEN_RULES = (
     ("testing:\n  alpha: {SM-I: 0.5, SM-II: 0.4, SM-III: 0.2}", "testing.alpha", 3, "sum to 1.1"),
     ("environment:\n  acceleration_hold_s: 0.25", "environment.acceleration_hold_s", 3, "multiple of the 0.1 s"),
     ("scenario: all", "scenario", 2, "Write scenarios: [cut_in, lead_brakes, cut_out]"),
+    ("scenarios: [cut_in, lead_brakes]\nexposure: {lead: 0.3}", "exposure.lead", 3, "Did you mean 'lead_brakes'"),
     ("scenarios:\n  - cut_in\n  - cutout", "scenarios.1", 4, "Did you mean 'cut_out'"),
     ("environment:\n  parameters: gone.yaml", "environment.parameters", 3, "a parameter file"),
     ("av:\n  sumo: {tau: 1}\nworld: {engine: twin}", "world.engine", 4, "Write engine: sumo"),

@@ -243,8 +243,24 @@ def test_how_often_it_is_asked_is_what_it_asks_for_and_one_that_names_none_is_to
             assert script_step_s(load_campaign(str(folder / name)).av) == (
                 0.2 if name in ("cfg.py", "named.py") else 0.1
             )
-    (note,) = capsys.readouterr().err.splitlines()
+    note, *asked = capsys.readouterr().err.splitlines()
     assert note.startswith("note: none.py names no --step-length")
+    # From 25 to 20 m/s in a step is more than SUMO's default type can.
+    assert [each.split(" of", 1)[0] for each in asked] == [
+        f"note: {name} asks for harder braking than 4.5 m/s², the decel" for name in ("none.py", *list(scripts)[1:])
+    ]
+
+
+@pytest.mark.parametrize(
+    "bound", ["traci.vehicle.setDecel('ego', 9.0)", "traci.vehicle.setSpeedMode('ego', 0)", "given"]
+)
+def test_a_script_that_bounds_its_braking_itself_is_told_nothing_of_its_type(bound, tmp_path, capsys):
+    body = text("traci.vehicle.setSpeed('ego', 20.0)").replace('"sumo"', '"sumo", "--step-length", "0.1"')
+    own = f"traci.vehicle.setSpeed('ego', 20.0); {bound}" if bound != "given" else "traci.vehicle.setSpeed('ego', 20.0)"
+    (tmp_path / "my.py").write_text(body.replace("traci.vehicle.setSpeed('ego', 20.0)", own), "utf-8")
+    overrides = ["av.traci_style.decel_mps2=4.5"] if bound == "given" else []
+    assert script_step_s(load_campaign(str(tmp_path / "my.py"), overrides).av) == 0.1
+    assert not capsys.readouterr().err
 
 
 def test_a_stored_answer_is_the_same_when_the_script_has_gone_or_is_broken(tmp_path):

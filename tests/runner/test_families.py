@@ -274,6 +274,15 @@ def test_a_verdict_that_assumed_numbers_may_turn_says_so(run, times, warned):
     assert "may turn" not in " ".join(hour_lines(own))
 
 
+def test_a_reading_of_the_regulation_that_turns_the_answer_is_said(run):
+    letter, at_once = run.content["readings"]
+    turned = {**run.content, "readings": [{**letter, "ratio": 0.531, "ratio_low": 0.462, "ratio_high": 1.21}, at_once]}
+    said = "! beside r157-cc-letter, another reading of UN R157, it is × 0.53 (0.46 to 1.21)"
+    for content, n in ((run.content, 0), (turned, 1)):
+        assert " ".join(" ".join(hour_lines(content)).split()).count("another reading") == n
+    assert said in " ".join(" ".join(hour_lines(turned)).split())
+
+
 def test_what_the_vehicle_did_before_bv_came_is_said_as_in_the_answer_of_one_scenario(run):
     of = run.content["families"]
     assert of["cut_in"]["before_event"]["built_in"]
