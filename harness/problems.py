@@ -114,6 +114,8 @@ def _how_to_mend(value: Any, kind: str, field: FieldInfo | None) -> str:
         return "Write a value after the colon, or delete the key for its default."
     if kind in _NUMBERS and isinstance(value, str) and re.fullmatch(r"[-+.\d_eE]*\d[-+.\d_eE]*", value):
         return "Remove the quotes."
+    if kind in _NUMBERS and isinstance(value, str) and re.fullmatch(r"\d+(\.\d+)? ?%", value):
+        return f"Write {float(value.rstrip(' %')) / 100.0:g}."
     if kind == "string_type" and isinstance(value, bool | int | float):
         return "Put it in quotes if it is meant as text."
     about = " ".join(field.description.split()) if field and field.description else ""

@@ -111,6 +111,7 @@ def _parsed(text: str, name: str) -> tuple[Any, Lines]:
         if error.context and not since:  # the path of a key, of `_checked_lines`
             where = f"{error.context} ({where})"
         mend = str(error.note or "Check indentation, quotes and brackets just before it.")
+        mend = "Use spaces, not tabs." if "'\\t'" in found else mend
     except ReaderError as error:
         before = text[: error.position].split("\n")
         where, found = f"{name}:{len(before)}:{len(before[-1]) + 1}", f"the character U+{error.character:04X}"
