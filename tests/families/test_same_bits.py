@@ -185,7 +185,7 @@ REFUSED = {
     "environment.lane_change_level=2": "environment.*numbers of cut-ins",
     "pool.library=ladder-2": r"pool\.library, r157-fsm",
     "environment.parameters=ndd-overtaking-2": r"environment\.parameters",
-    "scenario=lead_break": "Did you mean 'lead_brakes'",
+    "scenario=lead_break": "Write --set scenario=lead_brakes",
 }
 
 
