@@ -304,6 +304,7 @@ def _of_sum(folder: Path, ranges: Mapping[str, tuple[float, float]], progress: P
             sys.stderr.write(f"note: {name}: nothing moves it here: {refused.found}\n")
         else:
             bars += [_part(replace(bar, what=f"{name} {bar.what}"), *shares) for bar in found.bars]
+    progress.remark = ""
     return Sensitivity(tests_of_sum(stored), "crashes per hour", stored["beside"]["reference"], _longest_first(bars))
 
 
