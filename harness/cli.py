@@ -32,9 +32,10 @@ class _Commands(click.Group):
         options = [] if command is None else [each for each in command.params if isinstance(each, click.Option)]
         known = {name: each.is_flag for each in options for name in each.opts}
         for option, value in pairwise(rest):
-            if known.get(option) is False and value in known:
+            if known.get(option) is False and (value in known or (option == "--set" and "=" not in value)):
                 of_command = click.Context(command or self, ctx, name)
-                raise click.BadOptionUsage(option, f"Option '{option}' without a value, before {value}", of_command)
+                without = "a value, before" if value in known else "'=', but"
+                raise click.BadOptionUsage(option, f"Option '{option}' without {without} {value}", of_command)
         return name, command, rest
 
 

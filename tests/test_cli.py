@@ -102,6 +102,8 @@ def test_wrong_calls_end_with_2(capsys, arguments):
         ("run --episodes 100", "Write --set stop.episodes=…"),
         ("run --tests 100", "Write --set stop.episodes=…"),
         ("run --seed 2", "Write --set seed=…"),
+        ("run --scenarios all", "Write --scenario."),
+        ("run --set stop.rhw 0.1", "Write --set A.B=C."),
         ("run --html page.html", "the page is DIR/report.html"),
         ("compare --resume", "the same command with the same --out goes on"),
         ("run --accept", "Write --accept RATE|DRIVER."),

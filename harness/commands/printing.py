@@ -159,6 +159,8 @@ def _instead_of(option: str, command: click.Command) -> str:
 
     if option in _PAGES:
         return "Leave it out: the page is DIR/report.html, of every run."
+    if _option(command, singular := option.rstrip("s")):  # --scenarios
+        return f"Write {singular}."
     key = option.lstrip("-").replace("-", "_")
     key = _ALSO_CALLED.get(key, key)
     places = (f"{each}.{key}".lstrip(".") for each in places_of(key, Campaign))

@@ -67,7 +67,7 @@ class Estimates:
 
     ``unmet`` are the conditions of the stop rule that were met last, or not at all; ``traffic`` is what replicates
     leave open, ``milder`` see `harness.sampling.paths.milder_of`; ``cut_off`` is the rate of tests that ended with
-    the AV about to crash (`Block`).
+    the AV about to crash (`Block`), ``cut_off_test`` the first of them.
     """
 
     campaign: str
@@ -84,6 +84,7 @@ class Estimates:
     convergence: tuple[Point, ...]
     severity: Severity | None = None
     cut_off: float = 0.0
+    cut_off_test: int | None = None
     assumed: AssumedOfRate | None = None
     stopped_by: StoppedBy | None = None
     unmet: tuple[Note, ...] = ()
@@ -131,7 +132,7 @@ def estimate_blocks(
         crash_rate_per_1e6_km=None if distance_km is None else {key: 1e6 / distance_km * rate for key, rate in rates},
         estimates={name: of.shown if isinstance(of, Estimate) else of for name, of in done.estimates.items()},
         diagnostics=done.diagnostics.result(), convergence=tuple(done.convergence),
-        severity=done.severity, cut_off=done.cut_off,
+        severity=done.severity, cut_off=done.cut_off, cut_off_test=done.cut_off_test,
         assumed=_of_rate(Assumed(**manifest["assumed"]), best) if manifest.get("assumed") else None,
         stopped_by=manifest.get("stopped_by"), unmet=tuple(Note(**each) for each in manifest.get("unmet", ())),
         decision=manifest.get("decision"), milder=manifest.get("milder"),

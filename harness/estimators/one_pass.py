@@ -205,7 +205,7 @@ class PassResult:
 
     ``estimates`` begin with the ``headline``, the campaign's own, asked for or not; ``convergence`` is that on growing
     prefixes, for plots: block boundaries at least 1 % apart; ``severity`` is how hard its crashes are, ``cut_off`` the
-    rate of tests that ended with the AV about to crash.
+    rate of tests that ended with the AV about to crash, the first of which is ``cut_off_test``.
     """
 
     estimates: dict[str, Estimate | Unavailable]
@@ -215,6 +215,7 @@ class PassResult:
     convergence: list[Point]
     severity: Severity | None
     cut_off: float
+    cut_off_test: int | None
 
 
 def even(blocks: Iterable[Block]) -> Iterator[Block]:
@@ -274,8 +275,10 @@ def one_pass(
     if convergence[-1].n != n:
         convergence.append(_point(results[own]))
     estimates = {name: results[name] if why is None else Unavailable(why) for name, why in refusals.items()}
-    severity, cut_off = (None, 0.0) if impacts is None else (impacts.result(confidence), impacts.cut_off())
-    return PassResult(estimates, own, results[own], diagnostics, convergence, severity, cut_off)
+    of_impacts = (
+        (None, 0.0, None) if impacts is None else (impacts.result(confidence), impacts.cut_off(), impacts.cut_off_test)
+    )
+    return PassResult(estimates, own, results[own], diagnostics, convergence, *of_impacts)
 
 
 def _point(of: Estimate) -> Point:

@@ -66,6 +66,7 @@ class Impacts:
         self._first = counts_above_mps
         self._crashes: list[tuple[FloatArray, FloatArray]] = []
         self._cut_off: list[FloatArray] = []
+        self.cut_off_test: int | None = None  # the first
         self._n = 0
 
     def add(self, block: Block) -> None:
@@ -73,7 +74,10 @@ class Impacts:
         crash, self._n = block.crash, self._n + len(block)
         weight = np.asarray(block.stratum if block.drawn.shells is not None else np.exp(block.log_weight), np.float64)
         self._crashes.append((block.impact_mps[crash], weight[crash]))
-        self._cut_off.append(weight[block.columns.get("cut_off", np.zeros(len(block), np.bool_))])
+        cut_off = block.columns.get("cut_off", np.zeros(len(block), np.bool_))
+        self._cut_off.append(weight[cut_off])
+        if self.cut_off_test is None and cut_off.any():
+            self.cut_off_test = block.first_episode + int(cut_off.argmax())
         for speed, state in self._above.items():
             state.add(block if speed == self._first else block.harder_than(speed))
 

@@ -124,7 +124,8 @@ def doubts_of(campaign: Campaign, manifest: Mapping[str, Any], told: Estimates, 
     return {
         EARLY: n_left_out(campaign, told.diagnostics.get(EARLY, 0)), "milder": told.milder,
         "if_failed_had_crashed": times * best.details["crash_rate_if_failed_had_crashed"],
-        "cut_off": times * told.cut_off, "cautions": best.cautions, "repeated": manifest.get("repeated"),
+        "cut_off": times * told.cut_off, "cut_off_test": told.cut_off_test,
+        "cautions": best.cautions, "repeated": manifest.get("repeated"),
         "share_below_1_mps": None if severity is None else severity.share_below_1_mps,
         "assumed": told.assumed, "before_event": before_event(campaign, manifest, told.diagnostics),
     }  # fmt: skip
@@ -157,7 +158,8 @@ def warnings_of(scenario: str, of: Mapping[str, Any], unit: str, but: str = "") 
         yield f"{count(n)} of {tests} tests FAILED; had they all crashed, the rate would be {had}"
     worst = of["rate"] + of["cut_off"]
     if worst > max((1.0 + CUT_OFF_SHARE) * of["rate"], of["ci_high"]):
-        yield f"some tests ended while the vehicle was still closing in; had all crashed: {number(worst)}{unit}{but}"
+        ended = f"tests, as test {of['cut_off_test']}, ended while the vehicle was still closing in"
+        yield f"{ended}; had all crashed: {number(worst)}{unit}{but}"
     if touches is not None and touches > 0.5:
         left_out = f"crash.counts_above_mps={plain(TOUCH_MPS)} leaves them out"
         yield f"{share(touches)} of these crashes are touches below {plain(TOUCH_MPS)} m/s: {left_out}"
@@ -183,6 +185,7 @@ def _warnings(campaign: Campaign, manifest: Mapping[str, Any], told: Estimates) 
 
 
 NEVER_BRAKED = f"it never braked with {plain(BRAKED_MPS2)} m/s² or more: does it see the other vehicle?"
+BRAKES_BEFORE = "braked with nobody ahead, which makes cut-ins milder"
 
 
 def late_words(*, script: bool) -> str:
@@ -191,10 +194,10 @@ def late_words(*, script: bool) -> str:
     return f"it did nothing before the other car (BV) was in its lane; {what} shows it some 2 s earlier"
 
 
-def brakes_before_words(n: int, *, script: bool) -> str:
-    """That a vehicle slows down before anything happens, as one does whose own set speed is below that of the test."""
+def before_words(n: int, did: str, *, script: bool) -> str:
+    """What a vehicle does before anything happens, as one does whose own set speed is not that of the test."""
     speed = "getAllowedSpeed" if script else "set_speed_mps"
-    return f"in {count(n)} tests it braked with nobody ahead, which makes cut-ins milder: let it cruise at {speed}"
+    return f"in {count(n)} tests it {did}: let it cruise at {speed}, or set av.before_event=controller"
 
 
 def _acts(of: Mapping[str, Any] | None) -> Iterator[str]:
@@ -211,9 +214,10 @@ def _acts(of: Mapping[str, Any] | None) -> Iterator[str]:
     elif of["n_events"] and not of["n_took_over_early"]:
         yield late_words(script=of["script"])
     if n := of["n_braked_before"]:
-        yield brakes_before_words(n, script=of["script"])
+        yield before_words(n, BRAKES_BEFORE, script=of["script"])
     if (n := of["n_asked_to_speed_up"]) and not of["built_in"]:  # of our own it is known
-        yield f"in {count(n)} tests it asked to speed up before BV was in its lane; its speed was held (av.takes_over)"
+        did = "asked to speed up before BV was in its lane, and its speed was held"
+        yield before_words(n, did, script=of["script"])
 
 
 def _scope(campaign: Campaign, manifest: Mapping[str, Any], told: Estimates) -> str:

@@ -72,6 +72,8 @@ def check_av(campaign: Campaign | str | Path, n_episodes: AtLeastTwo = EPISODES)
     of_idm, idm_speed = _timed_run(prepare(resolve(idm, "av-check")), n_episodes)
     own = tested.av.limits if isinstance(tested.av.parameters, dict) else tested.av.parameters
     limits = own.min_acceleration_mps2, own.max_acceleration_mps2
+    if script := is_script(tested.av.controller or ""):  # clipped by its type's, see docs/controllers.md
+        limits = -tested.av.traci_style.decel_mps2, tested.av.traci_style.accel_mps2
     differing = tuple(i for i in range(n_episodes) if bits_of(first, i) != again[i])
     cause, clock_read_at = _likely_cause(source, differing[0]) if differing else (None, ())
     family = source.resolved.family
@@ -84,7 +86,7 @@ def check_av(campaign: Campaign | str | Path, n_episodes: AtLeastTwo = EPISODES)
         behaviour=_behaviour(first, limits, early=early), idm_behaviour=_behaviour(of_idm, limits, early=early),
         speed=own_speed, idm_speed=idm_speed, events=family.words.events,
         follows=_follows(first) if family.follows else None,
-        idm_follows=_follows(of_idm) if family.follows else None, script=is_script(tested.av.controller or ""),
+        idm_follows=_follows(of_idm) if family.follows else None, script=script,
     )  # fmt: skip
 
 

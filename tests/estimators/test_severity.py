@@ -48,6 +48,7 @@ def test_it_is_the_rate_of_harder_crashes_by_the_same_estimator(name, stored_run
     late = (rows.outcome == "timeout") & (rows.end_ttc_s < 2.0)
     tests = rows.groupby("component").size()[rows.component].to_numpy() if own == "shells" else len(rows)
     assert content["cut_off"] == pytest.approx((np.exp(rows.log_weight) / tests)[late].sum(), rel=1e-12)
+    assert content["cut_off_test"] == (int(rows.episode[late].min()) if late.any() else None)
     assert severity["median_mps"] == impact[np.searchsorted(share, 0.5)]
     assert severity["share_below_1_mps"] == pytest.approx(weight[crashes.impact_speed_mps <= 1.0].sum() / weight.sum())
     assert severity["share_above_5_mps"] == pytest.approx(weight[crashes.impact_speed_mps > 5.0].sum() / weight.sum())

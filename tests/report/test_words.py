@@ -92,6 +92,7 @@ def test_what_a_vehicle_of_the_users_own_did_while_bv_came_over_is_warned_of(nam
     warnings = "".join(said(run, manifest={"events_show": shows}, diagnostics=asked).warnings)
     assert ("cannot see the other car (BV)" in warnings) == blind
     assert ("1,234 tests it asked to speed up" in warnings) == held
+    assert ("or set av.before_event=controller" in warnings) == (name != "forced-krauss")
     assert ("1,234 tests it braked with nobody ahead" in warnings) == (name != "forced-krauss")
     assert ("it never braked with 1 m/s² or more" in warnings) == (name == "forced-krauss")
 
@@ -157,8 +158,9 @@ def test_tests_whose_time_was_up_are_warned_of_where_the_interval_leaves_them_ou
     run = read_run_folder(stored_run("shells-twin"))
     best, rate = run.estimates.best, run.estimates.best.crash_rate
     for severity in (run.estimates.severity, None):  # a crash or none
-        warnings = said(run, replace(best, ci_high=high * rate), severity=severity, cut_off=cut_off * rate).warnings
-        assert any("still closing in" in each for each in warnings) == warned
+        of = {"severity": severity, "cut_off": cut_off * rate, "cut_off_test": 17}
+        warnings = said(run, replace(best, ci_high=high * rate), **of).warnings
+        assert any("test 17, ended while" in each for each in warnings) == warned
 
 
 @pytest.mark.parametrize("value", [5e-324, 1e-320, 3e-7, -2e-9, 9.99999999999e-5, 2e6])

@@ -352,6 +352,8 @@ def test_of_a_vehicle_that_follows_it_is_said_how():
     )
     for each, text in zip((lags, early, faint), said, strict=True):
         assert verdict(each).startswith(f"LOOK AGAIN: {text}")
+    script = check_av(load_campaign("tests/controllers/scripts/plain.py", ["scenario=cut_out"]), 6)
+    assert script.limits_mps2 == (-4.5, 2.6)  # those of SUMO's default type
     never_brakes = "av={model: constant, parameters: {acceleration_mps2: 2}}"
     blind = check_av(load_campaign("idm", ["scenario=cut_out", never_brakes]), 6)
     assert blind.follows.headway_s > found.follows.headway_s  # it does nothing before the event
