@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
+import ast
 import math
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import closing
 from functools import partial
+from pathlib import Path
 
 import numpy as np
 import sumo_data
 
+from harness.campaign.python_files import TRACI_MODULES, file_and_function
 from harness.campaign.vehicle import AutomatedVehicle
+from harness.campaign.yaml_text import read_text
 from harness.controllers.hosts import Guard, cause_of
 from harness.controllers.protocol import EpisodeStart, Neighbour, Observation
-from harness.controllers.traci_script import ScriptController, TraciScript
+from harness.controllers.traci_script import ScriptController, ScriptTraci, TraciScript
 from harness.controllers.traci_vehicle import DECEL, VEH_ID, SeenVehicle, VehicleDomain
 from harness.errors import CampaignError
 from harness.vehicles.kinematics import STEP_S, VEHICLE_LENGTH_M
@@ -49,7 +53,9 @@ def script_maker(av: AutomatedVehicle, guard: Guard) -> Callable[[], ScriptContr
         if wrong.startswith(FAILS):
             expected = "a script of calls that docs/controllers.md has (“How it differs from TraCI”)"
             other = " If it asks for other vehicles, add --set av.traci_style.ego=NAME."
-            mend = f"Fix the script in that line.{other if 'is not known' in wrong else ''}"
+            lacking = list(_lacking(name))
+            mend = f"Take out, or replace, {', '.join(lacking)}." if lacking else "Fix the script in that line."
+            mend += other if "is not known" in wrong else ""
         raise CampaignError("av.controller", found, expected, mend)
 
     def vehicle(set_speed_mps: float, lv_name: str, bv_name: str) -> VehicleDomain:
@@ -59,6 +65,18 @@ def script_maker(av: AutomatedVehicle, guard: Guard) -> Callable[[], ScriptContr
         return made
 
     return partial(ScriptController, script, vehicle)
+
+
+def _lacking(name: str) -> Iterator[str]:
+    """What a script calls of ``traci`` that there is not, or is refused; with its lines."""
+    there = ScriptTraci(VehicleDomain(SPEED_MPS, VEH_ID))
+    tree = ast.parse(read_text(Path(file_and_function(name)[0])))
+    for each in (node for node in ast.walk(tree) if isinstance(node, ast.Attribute)):
+        module, *path = ast.unparse(each).split(".")
+        if module in TRACI_MODULES and len(path) == 2:
+            found = getattr(getattr(there, path[0], None), path[1], None)
+            if found is None or getattr(found, "__name__", "") == "refused":
+                yield f"{'.'.join(path)} (line {each.lineno})"
 
 
 class _AnyName(str):

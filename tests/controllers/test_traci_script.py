@@ -135,6 +135,9 @@ AT_THE_DOOR = {
     r"traci.vehicle has no getEmissionClass here: delete the line, or put in a value of your own \(my.py:7\)$": text(
         "traci.vehicle.setSpeed('ego', 9.0); traci.vehicle.getEmissionClass('ego')"
     ),
+    r"Take out, or replace, vehicle.moveTo \(line 7\), edge.getIDList \(line 9\)\.": text(
+        "traci.vehicle.setSpeed('ego', 9.0); traci.vehicle.moveTo('ego', 'e0_0', 1.0)\n\n    traci.edge.getIDList()"
+    ),
     "'truck' is not known, or not seen yet: there are LV, BV, ego": text(
         "traci.vehicle.setSpeed('ego', 9.0); traci.vehicle.getSpeed('truck')"
     ),
