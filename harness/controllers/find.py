@@ -59,7 +59,9 @@ def own_code(
     import_from(real_path(Path(module_name).parent) if is_file else Path.cwd())
     try:
         module = _of_file(Path(module_name)) if is_file else importlib.import_module(module_name)
-    except (Exception, SystemExit) as error:
+    except KeyboardInterrupt:
+        raise
+    except BaseException as error:  # of asyncio and pytest, too
         cause = f"{name}, whose module cannot be imported ({cause_of(error)})"
         meant = did_you_mean(module_name, [file.stem for file in Path.cwd().glob("*.py")])
         of_file = "Fix the module." if Path(module_name).exists() else "Put it back, or name another."
@@ -238,7 +240,7 @@ def _require_controller(made: Any, name: str) -> None:
         mend = "Write def step(self, seen): return 0.0, say: m/s², every 0.1 s (docs/controllers.md)."
         mend = "A function without arguments says what it makes: `def make() -> MyAv:`." if made is None else mend
         mend = "docs/policies.md has an adapter for what has predict(obs)." if hasattr(made, "predict") else mend
-        if meant := nearest("step", [each for each in dir(made) if each[0] != "_"]):
+        if meant := nearest("step", [each for each in dir(made) if each[0] != "_" and each != "step"]):
             mend = f"Rename {meant} to step."
         raise CampaignError("av.controller", f"{name} without step", expected, mend)
 

@@ -77,7 +77,7 @@ def cause_of(error: BaseException) -> str:
     With it comes the place in the user's code, and the name that was meant where it asks for one that is not there.
     """
     try:
-        text = f"{type(error).__name__}: {error}"
+        text = f"{type(error).__name__}: {error}".rstrip(": ")
         origin = error.name if isinstance(error, ImportError) else type(error).__module__
         if str(origin).partition(".")[0] in ("traci", "libsumo"):  # not what stands for it here
             text = f"{text.rstrip('.')}. Use the traci that is handed in (docs/controllers.md), not the module"

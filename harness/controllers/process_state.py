@@ -59,25 +59,26 @@ class FloatingPointModes:
 
 
 class OtherModules:
-    """What the harness itself rests on when it is made: modules and what they hold, and how others are imported."""
+    """What the harness rests on when it is made: modules, what they and classes hold, and how others are imported."""
 
     def __init__(self) -> None:
         self._loaded, self._finders, self._depth = dict(sys.modules), list(sys.meta_path), sys.getrecursionlimit()
         self._blocked = signal.pthread_sigmask(signal.SIG_BLOCK, ())
         watched = [name for name in self._loaded if name in WATCHED or name.partition(".")[0] == OURS[0]]
-        self._kept = {name: _functions_and_numbers(vars(self._loaded[name])) for name in watched}
+        held: dict[str, Any] = {name: self._loaded[name] for name in watched}
+        types = [each for module in held.values() for each in vars(module).values() if isinstance(each, type)]
+        held |= {f"{each.__module__}.{each.__qualname__}": each for each in types if each.__module__[:8] == "harness."}
+        self._kept = {name: (place, _functions_and_numbers(vars(place))) for name, place in held.items()}
 
     def restored(self) -> list[str]:
         """Names, as ``math`` or ``math.sqrt``, that had been replaced or deleted; they are as before."""
         gone = {name: module for name, module in self._loaded.items() if sys.modules.get(name) is not module}
         changed = [name for name in gone if name in WATCHED or name.partition(".")[0] in OURS]
-        sys.modules.update(
-            {name: module for name, module in gone.items() if name in changed or name not in sys.modules}
-        )
-        for name, kept in self._kept.items():
-            there = vars(self._loaded[name])
-            changed += [f"{name}.{key}" for key, value in kept.items() if there.get(key, self) is not value]
-            there.update(kept)
+        sys.modules |= {name: module for name, module in gone.items() if name in changed or name not in sys.modules}
+        for name, (place, kept) in self._kept.items():
+            for key in [key for key, value in kept.items() if vars(place).get(key, self) is not value]:
+                setattr(place, key, kept[key])
+                changed.append(f"{name}.{key}")
         if lost := [finder for finder in self._finders if finder not in (sys.meta_path or ())]:
             sys.meta_path = [*(sys.meta_path or ()), *lost]
             changed.append("sys.meta_path")

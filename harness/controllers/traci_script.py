@@ -12,7 +12,7 @@ import random
 import sys
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from functools import partial
+from functools import partial, reduce
 from importlib.machinery import ModuleSpec, PathFinder, SourceFileLoader
 from itertools import pairwise
 from pathlib import Path
@@ -267,10 +267,7 @@ class _Imports:
     def _import(self, name: str, namespace: Any = None, local: Any = None, fromlist: Any = (), level: int = 0) -> Any:
         top, *rest = name.split(".")
         if level == 0 and top in TRACI_MODULES:
-            found: Any = self._traci
-            for each in rest if fromlist else ():
-                found = getattr(found, each)
-            return found
+            return reduce(getattr, rest if fromlist else (), self._traci)
         if level == 0 and name == "random":
             if self._random is None:
                 self._random = random.Random(self._seed())  # noqa: S311 - for simulation

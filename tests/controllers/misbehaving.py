@@ -3,6 +3,7 @@
 import ctypes
 import math
 import os
+import pkgutil
 import random
 import resource
 import signal
@@ -209,7 +210,7 @@ class Global(IDM):
 
 
 class Replaces(IDM):
-    """Puts nothing in the place of another module, or of a function in it; of the judge one that ends no test."""
+    """Puts nothing in place of a module, or of what it or a class of it holds; of the judge one that ends no test."""
 
     def __init__(self, what, at):
         super().__init__()
@@ -218,7 +219,7 @@ class Replaces(IDM):
 
     def replace(self, at):
         if at == self.at and self.module:
-            setattr(sys.modules[self.module], self.name, (lambda *_: 0) if self.name == "judge" else None)
+            setattr(pkgutil.resolve_name(self.module), self.name, (lambda *_: 0) if self.name == "judge" else None)
         elif at == self.at:
             sys.modules[self.name] = None
 
@@ -300,6 +301,10 @@ class Batch:
 class StepMisspelt:
     def stp(self, seen):
         return 0.0
+
+
+class StepOfProperty:
+    step = property(lambda _: lambda seen: 0.0)
 
 
 class StepOfNothing:

@@ -106,7 +106,7 @@ IN_PROCESS = {
     "raises_what_cannot_be_printed": "step: UnprintableError, whose text raised ValueError",
     "raises_what_is_no_utf_8": "step: FileNotFoundError: no file \\udce9.csv",
     "exits": "step: SystemExit: 5",
-    "interrupts": "step: KeyboardInterrupt: ",
+    "interrupts": "step: KeyboardInterrupt",
     "hangs": f"step: StepTimeoutError: {LATE}",
     "hangs_and_swallows": f"step: StepTimeoutError: {LATE}",
     "hangs_in_start": f"start: StepTimeoutError: {LATE}",
@@ -219,6 +219,7 @@ REFUSED = [
     (_of("RaisesForOtherNames"), "av.controller", "cannot be made: RuntimeError: step_batch (misbehaving.py:"),
     (_of("says_nothing"), "av.controller", "without step"),
     (_of("StepMisspelt"), "av.controller", "fix:      Rename stp to step.\n"),
+    (_of("StepOfProperty"), "av.controller", "fix:      Write def step(self, seen): return 0.0"),
     (_of("StepOfNothing"), "av.controller", "fix:      Write def step(self, seen): in it.\n"),
     (POPEN, "av.controller", "Popen without step"),
 ]
@@ -250,6 +251,7 @@ def test_check_refuses_what_run_refuses_and_makes_nothing_but_controllers(av, wh
         "numpy",
         "harness",
         "harness.controllers.hosts.Guard",
+        "harness.controllers.hosts.Guard.acceleration",
         "harness.loop.loop.judge",
         "sys.excepthook",
         "threading.excepthook",
@@ -270,6 +272,12 @@ def test_it_is_named_also_where_it_fails_over_that_when_it_is_made(tmp_path, cap
     (tmp_path / "my.py").write_text(script, "utf-8")
     assert _run(tmp_path, f"{{controller: '{tmp_path}/my.py'}}") == EXIT_BAD_INPUT
     assert "found:    a vehicle that has replaced builtins.isinstance, which" in capsys.readouterr().err
+
+
+def test_a_module_that_raises_what_is_no_exception_is_named(tmp_path, capsys):
+    (tmp_path / "my.py").write_text("import asyncio\n\nraise asyncio.CancelledError\n", "utf-8")
+    assert _run(tmp_path, f"{{controller: '{tmp_path}/my.py:A'}}") == EXIT_BAD_INPUT
+    assert "my.py:A, whose module cannot be imported (CancelledError (my.py:3))" in capsys.readouterr().err
 
 
 @pytest.mark.slow
