@@ -215,7 +215,7 @@ def _bar(bar: dict[str, Any]) -> dict[str, str]:
 
     values = "" if bar["values"] is None else " … ".join(map(plain, bar["values"]))
     told = {"number": bar["what"], "known": f"{bar['known']} {values}", "rate": ends(bar["rate"])}
-    off = " … ".join(map(share, bar["off"])) if bar["off"] != [None, None] else ""
+    off = " … ".join(share(off, least=0.001) for off in bar["off"]) if bar["off"] != [None, None] else ""
     return {**told, "ratio": ends(bar["ratio"]), "error": off, "remark": bar_note(bar)}
 
 

@@ -176,7 +176,7 @@ def sensitivity_plot(found: Sensitivity) -> Plot:
     panel = PlotPanel(
         "What moves the answer", PlotAxis("times", low, high, log=True), y, height=76.0 + 22.0 * len(names)
     )
-    for kind, colour, label in ((fitted, "blue", "rate, fitted"), (~fitted, "vermillion", "rate, assumed")):
+    for kind, colour, label in ((fitted, "blue", "rate, fitted or counted"), (~fitted, "vermillion", "rate, assumed")):
         if kind.any():
             left, at = np.maximum(rate[0][kind], low), rows[kind]
             panel.add("boxes", colour, left, rate[1][kind], at - 0.3, at + 0.3, opacity=0.85, label=label)

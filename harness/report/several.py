@@ -140,7 +140,8 @@ def exposures(content: Mapping[str, Any]) -> str:
             told[kind][-1] += f" ({EXCLUDED})"
         if (left := of.get("assumed")) and (others := looking_words(moved := AssumedOfRate(**left))):
             told[kind][-1] += f" (crashes × {number(moved.most, 2)} if {others})"
-    return "events per hour of driving, " + "; ".join(f"{kind}: {', '.join(each)}" for kind, each in told.items())
+    parts = [f"{kind}: {', '.join(each)}" for kind, each in told.items()]
+    return "events per hour of driving, " + "; ".join([*parts, "other assumed numbers: harness sensitivity"])
 
 
 def between(low: float, high: float | None, rate: float) -> str:

@@ -301,9 +301,10 @@ def _of_sum(folder: Path, ranges: Mapping[str, tuple[float, float]], progress: P
         try:
             found = _of_one(folder / name, of_numbers[name], progress, per_event=True)
         except CampaignError as refused:
-            sys.stderr.write(f"note: {name}: nothing moves it here: {refused.found}\n")
+            sys.stderr.write(f"note: its tests tell no more of {name} than exposures: {refused.found}\n")
         else:
-            bars += [_part(replace(bar, what=f"{name} {bar.what}"), *shares) for bar in found.bars]
+            told = [bar.what if bar.what.startswith(f"{name}.") else f"{name} {bar.what}" for bar in found.bars]
+            bars += [_part(replace(bar, what=what), *shares) for bar, what in zip(found.bars, told, strict=True)]
     progress.remark = ""
     return Sensitivity(tests_of_sum(stored), "crashes per hour", stored["beside"]["reference"], _longest_first(bars))
 

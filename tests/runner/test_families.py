@@ -240,7 +240,7 @@ def test_what_moves_one_scenario_moves_the_sum_by_its_share(run, tmp_path, monke
 
     monkeypatch.setattr("harness.runner.other_traffic._of_one", of_one)
     assert main(["sensitivity", str(folder), "--range", "braking.stop_share=0:0.1"]) == 0
-    assert "note: cut_out: nothing moves it here: no number" in capsys.readouterr().err
+    assert "note: its tests tell no more of cut_out than exposures: no number" in capsys.readouterr().err
     bars = {bar["what"]: bar for bar in json.loads((folder / "sensitivity.json").read_text())["bars"]}
     assert len(bars) == 3 + 2
     for name, of in told["families"].items():
@@ -319,7 +319,7 @@ def test_each_scenario_may_have_a_file_of_its_own(tmp_path):
     one = campaign("scenarios=[lead_brakes]", f"environments={{lead_brakes: {tmp_path / 'mine.yaml'}}}")
     told = hour_lines(run_here(one, tmp_path / "run").content)
     assert " in SUMO’s twin, 1 scenario · " in told[0]
-    assert "  events per hour of driving, given: lead brakes 0.3" in told
+    assert "  events per hour of driving, given: lead brakes 0.3; other assumed" in "\n".join(told)
     with pytest.raises(CampaignError, match="no file"):
         campaign("environments={lead_brakes: ./none.yaml}")
     with pytest.raises(CampaignError, match="cut-out-1"):
