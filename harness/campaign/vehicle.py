@@ -50,7 +50,7 @@ class Limits(Section):
     min_acceleration_mps2: float = Field(-15.0, ge=-50.0, le=0.0, description="hardest braking it may ask for")
     max_acceleration_mps2: Positive = Field(10.0, le=50.0, description="hardest acceleration it may ask for")
     step_time_s: Positive = Field(10.0, le=3600.0, description="time that one call may take")
-    construction_time_s: Positive = Field(60.0, le=86_400.0, description="time that its constructor may take")
+    construction_time_s: Positive = Field(60.0, le=86_400.0, description="time that its import or constructor may take")
 
 
 class TraciProcess(Section):

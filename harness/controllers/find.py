@@ -124,13 +124,15 @@ def build_host(
 
         return VehicleHost(*told, fmu_maker(av.fmu), n_cells, names=names)
     try:
-        make = _script(av, guard) or _maker(av)
+        with guard:
+            guard.limit(makes=True)
+            make = _script(av, guard) or _maker(av)
         guard.modes.restored()  # imported libraries that were compiled for speed change how this thread computes
         first = _made(make, str(av.controller), guard)
         is_batch = _is_batch(first)
-    except HarnessError:
+    except (HarnessError, KeyboardInterrupt):
         raise
-    except (Exception, SystemExit) as error:  # who looks for an attribute runs the user's code, too
+    except BaseException as error:  # who looks for an attribute runs the user's code, too
         raise _not_made(str(av.controller), cause_of(error)) from error
     finally:
         guard.require_untouched()

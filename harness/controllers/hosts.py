@@ -114,16 +114,14 @@ class Guard:
     """Of all controllers of this process."""
 
     def __init__(self, limits: Limits) -> None:
-        self._low, self._high = limits.min_acceleration_mps2, limits.max_acceleration_mps2
+        self.low, self.high = limits.min_acceleration_mps2, limits.max_acceleration_mps2
         self._limits = [time_limit(limits, makes=makes) for makes in (False, True)]
-        self._makes = False
-        """Of the call under way."""
         self._pid = os.getpid()
         self.modes, self._others = FloatingPointModes(), OtherModules()
         self.construction_s: list[float] = []
         """Time that each constructor took."""
-        self._since: float | None = None
-        """When the call under way began, None between calls: the harness itself may take its time."""
+        self._makes, self._since = False, math.nan
+        """Of the call under way, and when it began; NaN between calls: the harness itself may take its time."""
         if parent_process() is not None:
             threading.Thread(target=self._watch, name="controller watchdog", daemon=True).start()
 
@@ -134,7 +132,13 @@ class Guard:
         return self
 
     def __exit__(self, *_: object) -> None:
+        self._since = math.nan
         signal.setitimer(signal.ITIMER_REAL, 0.0)
+
+    def limit(self, *, makes: bool) -> None:
+        """From now to the end of ``with guard``, or of the next call: `StepTimeoutError` when the time is over."""
+        self._makes, self._since = makes, monotonic()
+        signal.setitimer(signal.ITIMER_REAL, self._limits[makes][0])
 
     def call(
         self,
@@ -148,10 +152,9 @@ class Guard:
         One that ``makes`` a controller has a time limit of its own.
         """
         Guard.n_calls += 1
-        self._makes = makes
-        self._since = since = monotonic()
+        since = monotonic()
         try:
-            signal.setitimer(signal.ITIMER_REAL, self._limits[makes][0])
+            self.limit(makes=makes)
             answer = function(*arguments)
             if self.modes.restored():
                 return answer, CHANGED_MODES
@@ -163,7 +166,7 @@ class Guard:
             self.modes.restored()
             return None, cause_of(error)
         finally:
-            self._since = None  # the timer itself is set again by the next call
+            self._since = math.nan  # the timer itself is set again by the next call
             if makes:
                 self.construction_s.append(monotonic() - since)
             if os.getpid() != self._pid:  # a copy that the controller has made of the process
@@ -207,16 +210,12 @@ class Guard:
         value = float(answer)
         if not math.isfinite(value):
             return value, f"returned {value}, expected a finite acceleration in m/s2"
-        if not self._low <= value <= self._high:
-            return value, f"asked for {value:g} m/s2, outside of av.limits ({self._low:g} to {self._high:g})"
+        if not self.low <= value <= self.high:
+            return value, f"asked for {value:g} m/s2, outside of av.limits ({self.low:g} to {self.high:g})"
         return value, None
 
-    def outside(self, values: FloatArray) -> IntArray:
-        """Places of wrong accelerations in an array."""
-        return np.flatnonzero(~((values >= self._low) & (values <= self._high)))  # NaN is neither
-
     def _interrupt(self, _signal: int, _frame: FrameType | None) -> None:
-        if self._since is not None:
+        if not math.isnan(self._since):
             raise StepTimeoutError(self._limits[self._makes][1])
 
     def _watch(self) -> None:
@@ -224,7 +223,7 @@ class Guard:
         while True:
             sleep(0.5)
             since, makes = self._since, self._makes
-            if since is not None and monotonic() - since > 2.0 * self._limits[makes][0] + 1.0:
+            if monotonic() - since > 2.0 * self._limits[makes][0] + 1.0:
                 os._exit(HUNG_EXIT_CODES[makes])
 
 
@@ -375,7 +374,7 @@ class BatchHost(Host):
             return np.zeros(n), dict.fromkeys(cells.tolist(), f"{call}: {wrong}")
         if warms_up:
             return answer, {}
-        outside = self.guard.outside(answer).tolist()
+        outside = np.flatnonzero(~((answer >= self.guard.low) & (answer <= self.guard.high))).tolist()  # NaN is neither
         return answer, {int(cells[i]): f"step_batch: {self.guard.acceleration(answer[i])[1]}" for i in outside}
 
     def close(self) -> None:

@@ -274,10 +274,17 @@ def test_it_is_named_also_where_it_fails_over_that_when_it_is_made(tmp_path, cap
     assert "found:    a vehicle that has replaced builtins.isinstance, which" in capsys.readouterr().err
 
 
-def test_a_module_that_raises_what_is_no_exception_is_named(tmp_path, capsys):
-    (tmp_path / "my.py").write_text("import asyncio\n\nraise asyncio.CancelledError\n", "utf-8")
-    assert _run(tmp_path, f"{{controller: '{tmp_path}/my.py:A'}}") == EXIT_BAD_INPUT
-    assert "my.py:A, whose module cannot be imported (CancelledError (my.py:3))" in capsys.readouterr().err
+@pytest.mark.parametrize(
+    ("code", "cause"),
+    [
+        ("import asyncio\n\nraise asyncio.CancelledError\n", "CancelledError (my.py:3)"),
+        ("while True:\n    pass\n", "StepTimeoutError: no answer within 0.2 s (av.limits.construction_time_s) (my.py:"),
+    ],
+)
+def test_a_module_that_raises_what_is_no_exception_or_goes_on_for_good_is_named(code, cause, tmp_path, capsys):
+    (tmp_path / "my.py").write_text(code, "utf-8")
+    assert _run(tmp_path, f"{{controller: '{tmp_path}/my.py:A'{SHORT_MADE}}}") == EXIT_BAD_INPUT
+    assert f"my.py:A, whose module cannot be imported ({cause}" in capsys.readouterr().err
 
 
 @pytest.mark.slow
