@@ -121,10 +121,9 @@ def test_what_is_no_option_or_has_no_value_is_told_with_what_to_write(asked, fix
         ("run --scenario lead_brake", "fix:      Write --scenario lead_brakes."),
         ("run --scenario cut-in,lead_brake", "fix:      Write --scenario cut_in,lead_brakes."),
         *(
-            (f"run --accept {wrong}", "fix:      Write --accept 0.5*r157-cc.")
-            for wrong in ("0.5r157-cc", "0.5xr157-cc", "50%", "0,5*r157-cc", "r157-cc*0.5")
+            (f"run --accept {wrong}", "--accept 3e-7, which is per test, or r157-cc or 0.5*r157-cc")
+            for wrong in ("0.5xr157-cc", "50%", "0,5*r157-cc", "r157-cc*0.5", "1e-7/h")
         ),
-        ("run --accept 1e-7/h", "--accept 3e-7, which is per test, or --accept r157-cc"),
         ("run --accept r157cc", "fix:      Did you mean 'r157-cc'?"),
         ("run --accept -1", "fix:      Correct it; the key means: crashes per test"),
         ("run --exposure lead_brakes=abc", "found:    abc, of lead_brakes"),

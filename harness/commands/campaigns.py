@@ -183,9 +183,10 @@ def _told_as_typed(limit: str | None) -> Iterator[None]:
         yield
     except HarnessError as error:
         if limit is not None and re.match(r"(--set )?accept\.(times_reference|crash_rate_below)", error.where):
-            error.where, forms = f"--accept {limit}", "crashes per test, 3e-7, or a driver's: r157-cc or 0.5*r157-cc"
-            if meant := options.limit_meant(limit):
-                error.found, error.expected, error.mend = f"'{limit}'", forms, meant
+            error.where = f"--accept {limit}"
+            if not re.fullmatch(r"-?[\d.e-]+|([\d.]+\*)?[A-Za-z][\w.-]*", limit):
+                error.found, error.expected = f"'{limit}'", "crashes per test, or a driver's by name"
+                error.mend = "Write --accept 3e-7, which is per test, or r157-cc or 0.5*r157-cc, also of the sum."
         raise
 
 

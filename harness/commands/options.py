@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import re
 from collections.abc import Callable
 from itertools import chain, count, takewhile
 from pathlib import Path
@@ -155,18 +154,6 @@ def accepting(limit: str) -> list[str]:
             f"{{driver: {json.dumps(driver)}, at_most: {times or 1}}}",
         )
     return [f"accept.{keys[0]}={value}", f"accept.{keys[1]}=null"]
-
-
-def limit_meant(limit: str) -> str:
-    """How to write what is no limit; empty where it has the form of one."""
-    if re.fullmatch(r"-?[\d.e-]+|([\d.]+\*)?[A-Za-z][\w.-]*", limit):
-        return ""
-    swapped = re.sub(r"^([A-Za-z][\w.-]*) ?[x×*] ?([\d.,]+%?)$", r"\2*\1", limit)
-    of = re.fullmatch(r"(\d+(?:[.,]\d+)?) ?(%?) ?(?:[x×*]|of|times)? ?((?!e-?\d)[A-Za-z][\w.-]*)?", swapped)
-    if of is None:
-        return "Write --accept 3e-7, which is per test, or --accept r157-cc, which may also be per hour."
-    times = float(of[1].replace(",", ".")) / (100.0 if of[2] else 1.0)
-    return f"Write --accept {times:g}*{of[3] or 'r157-cc'}."
 
 
 def run_folder(campaign: Campaign, *, resume: bool) -> Path:
