@@ -10,7 +10,7 @@ from harness.errors import EXIT_DONE, EXIT_TOO_MANY_FAILED
 from harness.estimators.block import BRAKED_MPS2
 from harness.estimators.estimate import finite_json
 from harness.loop.cells import FAR_BEHIND_S
-from harness.report.words import BRAKES_BEFORE, NEVER_BRAKED, before_words, late_words
+from harness.report.words import BRAKES_BEFORE, NEVER_BRAKED, cruise_words, late_words
 from harness.shown import ShownInPython
 
 SLOW_S = 0.1
@@ -177,7 +177,7 @@ def _doubts(found: AvCheck) -> Iterator[str]:
     if follows is not None and follows.n_hit:
         yield f"in {follows.n_hit} of {found.n_episodes} tests it hit the vehicle ahead before anything happened."
     if found.shows and seen.n_braked_before:
-        yield f"{before_words(seen.n_braked_before, BRAKES_BEFORE, script=found.script)}."
+        yield f"{cruise_words([BRAKES_BEFORE.format(seen.n_braked_before)], script=found.script)}."
     if follows is not None and follows.headway_s > FAR_BEHIND_S:
         behind = f"{follows.headway_s:.1f} s behind the vehicle ahead"
         yield f"when the event begins it is {behind}, which makes that milder: let it keep up."

@@ -156,7 +156,7 @@ def _scope(content: Mapping[str, Any]) -> str:
     ended, target = words.ended_words(content["stopped_by"], content["decision"]), content["asked_rhw"]
     if content["stopped_by"] not in ("rhw", "accept", "below_reference") and target is not None:
         rhw = content["per_hour"]["rhw"]
-        ended += f"{'' if rhw is None else f', at ± {share(rhw)}'} (asked: ± {share(target)})"
+        ended += f"{'' if rhw is None else words.reached_words(rhw, share(rhw))} (asked: ± {share(target)})"
     if content["stopped_by"] == "episodes" and (target is not None or content["decision"] is not None):
         ended += words.GO_ON
     counted = ", that of the sum also of counted events," if content["counts_in_interval"] else ""

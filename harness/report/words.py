@@ -185,7 +185,7 @@ def _warnings(campaign: Campaign, manifest: Mapping[str, Any], told: Estimates) 
 
 
 NEVER_BRAKED = f"it never braked with {plain(BRAKED_MPS2)} m/s² or more: does it see the other vehicle?"
-BRAKES_BEFORE = "braked with nobody ahead, which makes cut-ins milder"
+BRAKES_BEFORE = "in {} tests it braked with nobody ahead, which makes cut-ins milder"
 
 
 def late_words(*, script: bool) -> str:
@@ -194,10 +194,10 @@ def late_words(*, script: bool) -> str:
     return f"it did nothing before the other car (BV) was in its lane; {what} shows it some 2 s earlier"
 
 
-def before_words(n: int, did: str, *, script: bool) -> str:
-    """What a vehicle does before anything happens, as one does whose own set speed is not that of the test."""
+def cruise_words(did: Sequence[str], *, script: bool) -> str:
+    """What a vehicle did before anything happened, as one does whose own set speed is not that of the test."""
     speed = "getAllowedSpeed" if script else "set_speed_mps"
-    return f"in {count(n)} tests it {did}: let it cruise at {speed}, or set av.before_event=controller"
+    return f"{'; '.join(did)}: let it cruise at {speed}, or set av.before_event=controller"
 
 
 def _acts(of: Mapping[str, Any] | None) -> Iterator[str]:
@@ -213,11 +213,11 @@ def _acts(of: Mapping[str, Any] | None) -> Iterator[str]:
         yield "SUMO changes lanes in one step: this vehicle cannot see the other car (BV) coming over, as drivers can"
     elif of["n_events"] and not of["n_took_over_early"]:
         yield late_words(script=of["script"])
-    if n := of["n_braked_before"]:
-        yield before_words(n, BRAKES_BEFORE, script=of["script"])
+    did = [BRAKES_BEFORE.format(count(n))] if (n := of["n_braked_before"]) else []
     if (n := of["n_asked_to_speed_up"]) and not of["built_in"]:  # of our own it is known
-        did = "asked to speed up before BV was in its lane, and its speed was held"
-        yield before_words(n, did, script=of["script"])
+        did.append(f"in {count(n)} tests it asked to speed up before BV was in its lane, and its speed was held")
+    if did:
+        yield cruise_words(did, script=of["script"])
 
 
 def _scope(campaign: Campaign, manifest: Mapping[str, Any], told: Estimates) -> str:
@@ -229,7 +229,7 @@ def _scope(campaign: Campaign, manifest: Mapping[str, Any], told: Estimates) -> 
         within = campaign.testing.shells.statement != ASSUMPTION_FREE and best.details.get("within")
         asked = end(within["rhw"]) if within else best.precision
         width = share(asked) if share(asked) != share(target) else f"{number(100.0 * asked)} %"  # where they differ
-        reached = f", at ± {width}" if asked <= WIDEST_RHW else f", at over ± {share(WIDEST_RHW)}"
+        reached = reached_words(asked, width)
         if not best.n_crashes or best.cautions:
             reached = ", precision not known" if best.n_crashes else ", no crash seen"
         more = GO_ON if stopped_by == "episodes" else remedy_words(manifest.get("remedy"))
@@ -239,6 +239,11 @@ def _scope(campaign: Campaign, manifest: Mapping[str, Any], told: Estimates) -> 
     elif stopped_by in ("rhw", "below_reference") and (given := campaign.testing.shells.statement) != ASSUMPTION_FREE:
         ended += f", given the {given}"
     return scope_words(best.confidence, ended)
+
+
+def reached_words(rhw: float, width: str) -> str:
+    """The relative half-width that was reached, or that it is too wide to say anything."""
+    return f", at ± {width}" if rhw <= WIDEST_RHW else f", at over ± {share(WIDEST_RHW)}"
 
 
 def scope_words(confidence: float, ended: str, counted: str = "") -> str:

@@ -207,6 +207,8 @@ def test_where_few_tests_reject_only_the_lower_ends_are_told(run, rhw, low, show
     content = {**run.content, "decision": decision, "per_hour": per_hour | {"rhw": rhw, "ci_low": 1e-3}}
     told = "\n".join(hour_lines({**content, "beside": beside | {"ratio_low": 2.5, "ratio_high": 900.0}}))
     ratio = "> 2.50 (crashes more)" in told
+    used_up = {**content, "stopped_by": "episodes", "asked_rhw": 0.3, "per_hour": {**per_hour, "rhw": 1e3 * rhw}}
+    assert "at over ± 1,000 % (asked: ± 30 %)" in " ".join(" ".join(hour_lines(used_up)).split())
     assert ("crashes so far      > 1.00 × 10⁻³ per hour" in told, ratio, "to 900" in told) == (shown, shown, not shown)
 
 
