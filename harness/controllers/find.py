@@ -251,8 +251,8 @@ def _made(make: Callable[[], Any], name: str, guard: Guard) -> Any:
     """Make one controller, so that what its constructor refuses is an error of the campaign, not of every episode."""
     with guard:
         controller, wrong = guard.call(make, makes=True)
-    if wrong is not None:
-        raise _not_made(name, wrong)
+    if wrong is not None or controller is None:
+        raise _not_made(name, wrong or "it returns None (is a return missing?)")
     _require_controller(controller, name)
     method = "step_batch" if _is_batch(controller) else "step"
     with suppress(ValueError):  # one in C may have no signature

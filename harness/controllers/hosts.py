@@ -58,8 +58,7 @@ def time_limit(limits: Limits, *, makes: bool) -> tuple[float, str]:
 def death_cause(exit_code: int | None, limits: Limits) -> str:
     """Cause for the record of an episode whose controller took the process along."""
     if exit_code in HUNG_EXIT_CODES:
-        _, late = time_limit(limits, makes=exit_code == HUNG_EXIT_CODES[True])
-        return f"{late}, and the call could not be interrupted"
+        return f"{time_limit(limits, makes=exit_code == HUNG_EXIT_CODES[1])[1]}, and the call could not be interrupted"
     if exit_code == CLOSED_PIPE_EXIT_CODE:
         return "the controller closed file descriptors that are not its own (os.close, os.closerange)"
     if exit_code == -signal.SIGSTOP:

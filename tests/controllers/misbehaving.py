@@ -183,6 +183,10 @@ def says_nothing():
     Path("called").touch()
 
 
+def forgets_to_return() -> IDM:
+    IDM()
+
+
 class Prints(IDM):
     def __init__(self):
         super().__init__()
