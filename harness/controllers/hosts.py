@@ -9,7 +9,7 @@ import math
 import os
 import signal
 import threading
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Coroutine, Generator, Iterable
 from dataclasses import dataclass, field
 from functools import partial
 from multiprocessing import parent_process
@@ -51,8 +51,7 @@ BeforeTest = Callable[[int], str | None]
 def time_limit(limits: Limits, *, makes: bool) -> tuple[float, str]:
     """Of a constructor or of any other call: seconds, and the cause where they are over."""
     key = "construction_time_s" if makes else "step_time_s"
-    seconds: float = getattr(limits, key)
-    return seconds, f"no answer within {seconds:g} s (av.limits.{key})"
+    return getattr(limits, key), f"no answer within {getattr(limits, key):g} s (av.limits.{key})"
 
 
 def death_cause(exit_code: int | None, limits: Limits) -> str:
@@ -228,7 +227,12 @@ class Guard:
 
 def optional(name: str, *arguments: Any) -> Callable[[Any], None]:
     """Calls a controller's method of this name, if it has one."""
-    return lambda controller: getattr(controller, name, lambda *_: None)(*arguments)
+
+    def call(controller: Any) -> None:
+        if isinstance(getattr(controller, name, lambda *_: None)(*arguments), Coroutine | Generator):
+            raise TypeError(f"{name} is async, or yields: nothing of it was run")
+
+    return call
 
 
 @dataclass
@@ -351,10 +355,9 @@ class BatchHost(Host):
         cells, announced = cells[sound], announced[sound]
         if not cells.size:
             return failures
-        random = [controller_random(self.seed, index) for index in announced.tolist()]
+        told = read_only(cells), read_only(announced), [controller_random(self.seed, i) for i in announced.tolist()]
         with self.guard:
-            begin = optional("start_batch", read_only(cells), read_only(announced), random)
-            _, wrong = self.guard.call(begin, self.controller)
+            _, wrong = self.guard.call(optional("start_batch", *told), self.controller)
         return failures if wrong is None else failures | dict.fromkeys(cells.tolist(), f"start_batch: {wrong}")
 
     def act(self, observation: BatchObservation, *, warms_up: bool = False) -> tuple[FloatArray, Failures]:
@@ -363,8 +366,7 @@ class BatchHost(Host):
 
         def ask() -> Any:
             answer = self.controller.step_batch(observation)
-            is_no_answer = warms_up and _numbers(n, answer)[1] is not None
-            return np.zeros(n) if is_no_answer else answer
+            return np.zeros(n) if warms_up and _numbers(n, answer)[1] is not None else answer
 
         with self.guard:
             answer, wrong = self.guard.call(ask, check=partial(_numbers, n))

@@ -7,6 +7,7 @@ import sys
 from collections import Counter
 from contextlib import nullcontext
 from pathlib import Path
+from types import SimpleNamespace
 from unittest.mock import Mock
 
 import numpy as np
@@ -17,7 +18,7 @@ from harness.campaign.campaign import Campaign
 from harness.campaign.vehicle import Limits
 from harness.cli import cli, main
 from harness.controllers.find import build_host
-from harness.controllers.hosts import Guard, _numbers
+from harness.controllers.hosts import Guard, _numbers, optional
 from harness.controllers.process_state import OtherModules
 from harness.errors import EXIT_BAD_INPUT, EXIT_DONE, EXIT_TOO_MANY_FAILED, CampaignError, TooManyFailedError
 from harness.printed import PRINTED
@@ -304,6 +305,19 @@ def test_what_the_process_itself_is_told_is_as_it_was():
     assert others.restored() == ["sys.setrecursionlimit", "signal.pthread_sigmask"]
     assert sys.getrecursionlimit() == depth
     assert not others.restored()
+
+
+@pytest.mark.filterwarnings("ignore:coroutine")
+def test_a_start_that_is_async_or_yields_has_failed_since_nothing_of_it_was_run():
+    async def later(_):
+        pass
+
+    def parts(_):
+        yield
+
+    with Guard(Limits()) as guard:
+        found = [guard.call(optional("start", None), SimpleNamespace(start=start)) for start in (later, parts)]
+    assert found == 2 * [(None, "TypeError: start is async, or yields: nothing of it was run")]
 
 
 def test_a_call_whose_time_is_over_at_once_has_failed_like_any_that_is_late(monkeypatch):

@@ -10,6 +10,7 @@ import pytest
 
 from examples import idm_traci_style
 from examples.idm import IDM
+from harness.families.lead_brakes.words import HEADWAY
 from harness.sampling import prepare
 from harness.vehicles.kinematics import STEP_S
 from harness.vocabulary import CRASH
@@ -162,3 +163,8 @@ class WatchingTraci(idm_traci_style.IDM):
         known = {name: [getattr(there, ask)(name) for ask in self.asked] for name in there.getIDList()}
         SEEN[-1][1].append((known, there.getLeader(veh_id), there.getAllowedSpeed(veh_id)))
         super().on_step(traci, veh_id, time)
+
+
+def test_the_headway_of_one_that_stands_when_braking_begins_is_a_number():
+    seen = {"event_gap_m": np.array([30.0]), "lead_speed_mps": np.array([20.0]), "event_rate_mps": np.array([20.0])}
+    assert HEADWAY.of(seen) == 30.0

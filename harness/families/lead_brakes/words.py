@@ -26,7 +26,7 @@ HEADWAY = Shown(
     "headway at the onset",
     "s",
     ("Headway at", "onset"),
-    lambda of: np.asarray(of["event_gap_m"] / (of["lead_speed_mps"] - of["event_rate_mps"])),
+    lambda of: of["event_gap_m"] / np.maximum(of["lead_speed_mps"] - of["event_rate_mps"], 1.0),  # AV may stand
     beyond=1.2,
     cell=0.1,
 )
