@@ -69,7 +69,7 @@ def own_code(
         raise CampaignError(where, cause, "a Python module that can be imported", meant or mend) from error
     found = getattr(module, class_name, None)
     if not callable(found):
-        own = [name for name, each in vars(module).items() if getattr(each, "__module__", "") == module.__name__]
+        own = [k for k, v in vars(module).items() if callable(v) and getattr(v, "__module__", "") == module.__name__]
         lacks = f"no class or function {class_name} in {getattr(module, '__file__', module_name)}"
         mend = did_you_mean(class_name, own) or f"It has: {', '.join(own) or 'none'}."
         raise CampaignError(where, lacks, what, mend)

@@ -290,12 +290,10 @@ class VehicleHost(Host):
         One that ``warms_up`` is shown what was: what it answers is neither used nor judged, and 0 if it is no number;
         what it raises counts.
         """
-        answer = np.zeros(observation.cell.size)
-        failures = {}
-        rows = zip(*(column.tolist() for column in observation), strict=True)
+        answer, failures = np.zeros(observation.cell.size), dict[int, str]()
         call, check = self.guard.call, None if warms_up else self.guard.acceleration
         with self.guard:
-            for i, (k, _, *seen) in enumerate(rows):
+            for i, (k, _, *seen) in enumerate(zip(*(column.tolist() for column in observation), strict=True)):
                 if (controller := self._controllers[k]) is None:
                     continue  # its episode has failed in this turn's start
                 value, wrong = call(_step, controller, seen, check=check)

@@ -307,6 +307,9 @@ class StepMisspelt:
         return 0.0
 
 
+an_object = StepMisspelt()
+
+
 class StepOfProperty:
     step = property(lambda _: lambda seen: 0.0)
 
