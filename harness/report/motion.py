@@ -17,7 +17,6 @@ from xml.sax.saxutils import quoteattr
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.compute as pc
 from pyarrow import csv
 
 from harness.arguments import checked
@@ -74,8 +73,8 @@ def writer_of(file: Path) -> Callable[[ReplayResult, Path], list[Path] | None]:
 
 def _write_csv(result: ReplayResult, file: Path) -> None:
     trace = result.trace
-    time_s = pa.array(trace.column("step").to_numpy() * STEP_S).cast(pa.float64())
-    rows = trace.drop_columns(["episode", "step"]).add_column(0, "time_s", pc.round(time_s, 1))
+    time_s = pa.array(np.round(trace.column("step").to_numpy() * STEP_S, 1))
+    rows = trace.drop_columns(["episode", "step"]).add_column(0, "time_s", time_s)
     write_atomically(file, lambda unfinished: csv.write_csv(rows, unfinished))
 
 

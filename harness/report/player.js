@@ -188,7 +188,7 @@
       const { lane, top, low, middle, ruler, star } = road, eye = camera(t) - anchor / scale;
       set(middle, { "stroke-dashoffset": (eye % 12) * scale });
       set(ruler, { "stroke-dashoffset": (eye % 10) * scale });
-      let ends = width - 6;
+      let ends = width - 6;  // of names above the road, where no vehicle is
       for (const { track, ghost, group, lights, label } of moving) {
         const now = at(track, t), x = (now.x - eye) * scale, rear = x - LENGTH * scale;
         const y = top + lane * (0.5 + sideways(track));
@@ -197,19 +197,18 @@
         group.classList.toggle("faded", crashed || (track === main && !there(tracks.AV)));
         set(group, { transform: `translate(${x.toFixed(2)} ${y.toFixed(2)})` });
         show(lights, !gone && now.a <= BRAKES);
-        const beyond = rear > width - 8, far = Math.round(now.x - at(tracks.AV, t).x - LENGTH);
+        const beyond = rear > width - 0.4 * LENGTH * scale - 10, far = Math.round(now.x - at(tracks.AV, t).x - LENGTH);
         show(label, seen && (ghost >= 0 || beyond));
         const name = `${x < 8 ? "◂ " : ""}${called(track)}${crashed ? " crashed" : ""}`;
         label.textContent = beyond ? `${name} ${far} m ▸` : name;
-        const aside = beyond && ghost < 0, edge = aside ? ends : width - 6, from = beyond ? edge : clamp(rear, 4, width - 130);
-        const height = ghost >= 0 ? low + 18 + 14 * ghost : y + 4;
-        if (aside && seen) ends -= 9 * label.textContent.length;
-        else if (seen && !beyond && x > ends - 100) ends = Math.min(ends, rear - 6);  // beside it, not over it
-        set(label, { x: from, y: height, "text-anchor": beyond ? "end" : "start" });
+        const room = 8 * label.textContent.length, edge = ghost < 0 ? ends : width - 6;
+        const from = beyond ? edge : clamp(rear, 4, Math.max(width - room, 4));
+        if (beyond && ghost < 0 && seen) ends -= room + 10;
+        set(label, { x: from, y: ghost < 0 ? top - 5 : low + 18 + 14 * ghost, "text-anchor": beyond ? "end" : "start" });
       }
       const hit = `${(at(tracks.AV, t).x - eye) * scale} ${top + 1.5 * lane}`;
       show(star, tracks.AV.crash !== null && t >= tracks.AV.crash * STEP - NEAR);
-      set(star, { transform: `translate(${hit}) scale(${clamp(scale / 18, 0.6, 1.3)})` });
+      set(star, { transform: `translate(${hit}) scale(${clamp(scale / 18, 0.4, 1.3)})` });
       clock.textContent = `${t.toFixed(2)} s`;
       slider.value = Math.round(t / STEP);
       for (const [track, boxes] of cells) {

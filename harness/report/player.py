@@ -270,7 +270,9 @@ def _facts(scene: Scene, event: str) -> list[tuple[str, str]]:
         "AV brakes": f"at up to {hardest} m/s²",
     }
     moments = [(step, name) for step, name in scene["moments"] if name in told]
-    facts = [(name, f"{_when(step, cut, words.since)}: {told[name]}") for step, name in moments]
+    ends = f"{STEP_S * cut:.1f} to {STEP_S * (cut + 1):.1f} s"  # a lane changes in this step, a row has it at its end
+    times = [ends if step == cut and family.crosses >= 0 else _when(step, cut, words.since) for step, _ in moments]
+    facts = [(name, f"{when}: {told[name]}") for when, (_, name) in zip(times, moments, strict=True)]
     facts += [("AV brakes", "never")] if av["brakes"] is None else []
     facts.append(("AV", _ending(av, scene)))
     for each in scene["ghosts"]:
@@ -296,7 +298,7 @@ def _ending(track: Scene, scene: Scene) -> str:
         return f"avoids it, {gap} at the closest" + f" since {family.words.since}" * bool(scene["onset"] < cut)
     v, v_bv = (tenths(float(each["v"][crash - first])) for each in (track, bv))
     from_the_side = family.crosses == family.principal and scene["onset"] < cut and crash == cut + 1
-    who = f"{name} strikes its side" if from_the_side else f"strikes {name} from behind"
+    who = f"{name} moves sideways into it" if from_the_side else f"strikes {name} from behind"
     impact = tenths(_closing(track, bv, crash - first))
     speeds = f"it drives {v} m/s, {name} {v_bv} m/s"
     return f"crashes at {_when(crash, cut, family.words.since)}: {who}; {speeds}: impact {impact} m/s"

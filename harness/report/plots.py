@@ -34,6 +34,7 @@ SHARES = {0.0: "grid", 0.25: "red-1", 0.5: "red-2", 0.75: "red-4", 1.0: "red-6"}
 """Up to which share of events that crash a cell of the map has a colour."""
 WHO = {"both": "grey", "only A": "blue", "only B": "reference"}
 """Who crashes, and the colour: on the page the player draws B in that of reference drivers."""
+KNOWN = {"fitted": "blue", "counted": "green", "assumed": "vermillion"}
 MOST_BARS = 16
 LARGEST = 9.0
 
@@ -171,21 +172,22 @@ def sensitivity_plot(found: Sensitivity) -> Plot:
     ends = np.array([[np.nanmin([*of, 1.0]), np.nanmax([*of, 1.0])] for bar in shown for of in (bar.rate, bar.ratio)])
     rate, ratio = ends[0::2].T, ends[1::2].T
     low, high = 0.9 * float(max(ends[:, 0].min(), 1e-3)), 1.1 * float(ends[:, 1].max())
-    rows, fitted = np.arange(len(names)), np.array([bar.known != "assumed" for bar in shown])
+    rows, known = np.arange(len(names)), np.array([bar.known for bar in shown])
     y = PlotAxis("", len(names) - 0.4, -0.6, names=names)
     panel = PlotPanel(
         "What moves the answer", PlotAxis("times", low, high, log=True), y, height=76.0 + 22.0 * len(names)
     )
-    for kind, colour, label in ((fitted, "blue", "rate, fitted or counted"), (~fitted, "vermillion", "rate, assumed")):
-        if kind.any():
+    for name, colour in KNOWN.items():
+        if (kind := known == name).any():
             left, at = np.maximum(rate[0][kind], low), rows[kind]
-            panel.add("boxes", colour, left, rate[1][kind], at - 0.3, at + 0.3, opacity=0.85, label=label)
+            panel.add("boxes", colour, left, rate[1][kind], at - 0.3, at + 0.3, opacity=0.85, label=f"rate, {name}")
     thin = rows - 0.06, rows + 0.06
     most = int(np.abs(np.log(np.maximum(ratio, low))).max(axis=0).argmax())  # what moves one need not move the other
     panel.add("boxes", "ink", np.maximum(ratio[0], low), ratio[1], *thin, label=f"its ratio to {found.driver}")
     panel.add("line", "muted", [1.0, 1.0], [y.low, y.high], dash=DASHED, width=1.0)
     text = (
-        "Fitted numbers move over nine tenths of what their data leave open, assumed ones over the stated range. "
+        "Fitted and counted numbers move over nine tenths of what their data leave open, assumed ones over the stated "
+        "range. "
         f"The rate depends most on {names[0]}: × {number(rate[0][0], 2)} to × {number(rate[1][0], 2)}; its ratio to "
         f"{found.driver} on {names[most]}: × {number(ratio[0][most], 3)} to × {number(ratio[1][most], 3)}."
     )
@@ -249,10 +251,9 @@ def _map(axes: tuple[Shown, Shown], rows: Mapping[str, FloatArray], met: BoolArr
     across, up = (PlotAxis(each.axis, float(of[0]), float(of[-1])) for each, of in zip(axes, edges, strict=True))
     panel = PlotPanel(f"Share of {events} that crash", across, up, height=300.0)
     for low, (high, colour) in zip((-0.5, *SHARES), SHARES.items(), strict=False):
-        if ((shares > low) & (shares <= high)).any():
-            row, column = np.nonzero((shares > low) & (shares <= high))
-            label = f"≤ {share(high)}" if high else "tested, none"
-            panel.add("boxes", colour, x[column], x[column + 1], y[row], y[row + 1], label=label)
+        row, column = np.nonzero((shares > low) & (shares <= high))
+        label = f"≤ {share(high)}" if high else "tested, none"
+        panel.add("boxes", colour, x[column], x[column + 1], y[row], y[row + 1], label=label)
     return panel
 
 

@@ -200,7 +200,7 @@ def test_axe_finds_nothing_and_nothing_is_wider_than_the_screen(width, scheme, b
     context.close()
 
 
-def test_a_vehicle_out_of_view_is_named_beside_its_lane_and_not_over_others(opened, crashing):
+def test_a_vehicle_out_of_view_is_named_above_the_road_where_no_other_is(opened, crashing):
     file = write_report(copy_of(crashing["lead_brakes"], crashing["lead_brakes"].parent / "far"))
     text, scenes = file.read_text(), scenes_in(file.read_text())
     data = re.search(r'<script type="application/json">(.*?)</script>', text, re.DOTALL)[1]
@@ -212,8 +212,7 @@ def test_a_vehicle_out_of_view_is_named_beside_its_lane_and_not_over_others(open
     file.write_text(text.replace(data, json.dumps(scenes)))
     page = opened(file)
     label, road = page.get_by_text(re.compile(r"^LV \d+ m")), page.locator(".asphalt").bounding_box()
-    lower = label.bounding_box()["y"] - road["y"] - road["height"] / 2
-    assert 0.0 < lower < road["height"] / 2
-    other = page.locator(".car.dashed .body").first.bounding_box()
-    assert road["x"] < label.bounding_box()["x"] + label.bounding_box()["width"] < other["x"]
+    box, other = label.bounding_box(), page.locator(".car.dashed .body").first.bounding_box()
+    assert box["y"] + box["height"] <= road["y"] + 1.0
+    assert road["x"] < box["x"] < box["x"] + box["width"] <= road["x"] + road["width"]
     assert other["x"] < road["x"] + road["width"] - 8.0

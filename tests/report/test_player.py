@@ -9,6 +9,7 @@ from pathlib import Path
 from xml.etree import ElementTree
 
 import numpy as np
+import pandas as pd
 import pyarrow as pa
 import pyarrow.compute as pc
 import pytest
@@ -66,7 +67,7 @@ def test_a_page_holds_the_motion_to_the_last_bit(name, stored_run, tmp_path):
         assert scene["event"] == cut_in
         assert scene["onset"] == result.row.get("onset_step", cut_in)
         assert len(scene["ghosts"]) == (0 if cut_in is None else 2)
-        touched = [fact for name, fact in scene["facts"] if name == "AV" and "BV strikes its side" in fact]
+        touched = [fact for name, fact in scene["facts"] if name == "AV" and "BV moves sideways into it" in fact]
         assert bool(touched) == (result.row.get("contact") == "side" and scene["onset"] < cut_in)
 
 
@@ -151,6 +152,20 @@ def test_others_who_follow_are_told_with_their_headway(scenario, crashing, tmp_p
     for ghost in scene["ghosts"]:
         headway_s = (lead["x"][at] - VEHICLE_LENGTH_M - ghost["x"][at]) / ghost["v"][at]
         assert f", {headway_s:.1f} s behind at the onset: " in dict(scene["facts"])[ghost["name"]]
+
+
+@pytest.mark.parametrize("name", ["cut_out", "forced-lateral-sumo"])
+def test_words_and_csv_say_the_same_of_when_a_lane_changes(name, crashing, stored_run, tmp_path):
+    """And that of a vehicle that has left is clear; times are rounded to their step."""
+    folder, file = crashing[name] if name in crashing else stored_run(name), tmp_path / "crash.csv"
+    harness.write_motion(result := harness.replay(folder, crashed(folder)[0]), file)
+    rows, who = pd.read_csv(file), "LV" if name == "cut_out" else "BV"
+    rows = rows[rows.vehicle == who]
+    changed = rows[rows.lane != rows.lane.iloc[0]].iloc[0]
+    told = dict(result.scene["facts"])[f"{who} {'has left' if who == 'LV' else 'enters'} the lane"]
+    assert re.match(rf"{changed.time_s - 0.1:.1f} to {changed.time_s:.1f} s: ", told)
+    assert changed.lateral_m >= 1.7
+    assert (rows.time_s * 10).round().div(10).equals(rows.time_s)
 
 
 # -- for other tools --

@@ -139,6 +139,9 @@ class FollowingFamily(Family):
         lead = np.where(clear - onset < traffic.numbers["max_steps"], clear - onset - 1, 0)
         return Chosen(facts, np.where(event < 0, -1, onset + lead), np.where(event < 0, 0, lead))
 
+    def onset(self, traffic: FollowingTraffic, chosen: Chosen) -> IntArray:
+        return np.where(chosen.at < 0, -1, int(traffic.numbers["onset"]))  # records keep no lead
+
     def facts_of(self, traffic: FollowingTraffic, events: RecordArray, speed_mps: FloatArray) -> dict[str, FloatArray]:
         """Facts of the family's own, of events (n,) with a vehicle ahead at a speed: here those of its grid."""
         return {each.name: events[each.name] for each in self.columns if each.name in (EVENT_DTYPE.names or ())}
