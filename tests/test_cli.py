@@ -103,6 +103,7 @@ def test_wrong_calls_end_with_2(capsys, arguments):
         ("run --tests 100", "Write --set stop.episodes=…"),
         ("run --seed 2", "Write --set seed=…"),
         ("run --scenarios all", "Write --scenario."),
+        ("run --output x", "Write --out."),
         ("run --set stop.rhw 0.1", "Write --set A.B=C."),
         ("run --html page.html", "the page is DIR/report.html"),
         ("compare --resume", "the same command with the same --out goes on"),

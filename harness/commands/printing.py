@@ -159,8 +159,9 @@ def _instead_of(option: str, command: click.Command) -> str:
 
     if option in _PAGES:
         return "Leave it out: the page is DIR/report.html, of every run."
-    if _option(command, singular := option.rstrip("s")):  # --scenarios
-        return f"Write {singular}."
+    names = (name for each in command.params for name in each.opts)
+    if meant := next((name for name in names if name[:2] == "--" and option.startswith(name)), None):
+        return f"Write {meant}."  # --scenarios, --output
     key = option.lstrip("-").replace("-", "_")
     key = _ALSO_CALLED.get(key, key)
     places = (f"{each}.{key}".lstrip(".") for each in places_of(key, Campaign))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import importlib
+import math
 import os
 import re
 import sys
@@ -308,18 +309,27 @@ def require_controller(av: AutomatedVehicle) -> str | None:
         raise CampaignError(error.where, error.found, "a controller that can be made", error.mend) from error
 
 
+LONGEST_IDLE_S = 1.0
+"""Steps in which a script need not look at a vehicle [assumed]."""
+
+
 def script_step_s(av: AutomatedVehicle) -> float:
     """How often a TraCI script is asked (s), as it asks for when it is tried; 0 of any other controller."""
     if not is_script(name := str(av.controller)):
         return 0.0
     from harness.controllers.traci_ego import asked_for  # noqa: PLC0415 - few campaigns have one
 
-    (every, hardest), bound = run_apart(av, asked_for, av), av.traci_style.decel_mps2
+    (every, hardest, idle), bound = run_apart(av, asked_for, av), av.traci_style.decel_mps2
     file = real_path(file_and_function(name)[0]).name
     if not every:
         told = "names no --step-length, nor does its .sumocfg: it is asked every 0.1 s, where SUMO would ask every 1 s"
         _tell_once(f"{file} {told}")
-    if hardest > bound and "decel_mps2" not in av.traci_style.model_fields_set:
+    if (idle_s := idle * STEP_S * (every or 1)) > LONGEST_IDLE_S:
+        told = f"looks at no vehicle in the first {idle_s:.1f} s of a test, in which a car may cut in"
+        _tell_once(f"{file} {told}: a test is one run of it from its first line, so leave out steps that only wait")
+    if math.isinf(hardest):
+        _tell_once(f"{file} sets a speed mode in which no decel bounds its braking (docs/controllers.md)")
+    elif hardest > bound and "decel_mps2" not in av.traci_style.model_fields_set:
         told = f"asks for harder braking than {bound:g} m/s², the decel of SUMO's default type, and gets that"
         _tell_once(f"{file} {told}; of another type: --set av.traci_style.decel_mps2=8, say")
     return STEP_S * (every or 1)

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import ast
+import io
 import math
 import os
 from collections.abc import Callable, Iterator
-from contextlib import closing
+from contextlib import closing, redirect_stdout
 from functools import partial
 from pathlib import Path
 
@@ -26,6 +27,8 @@ from harness.vehicles.kinematics import STEP_S, VEHICLE_LENGTH_M
 OTHERS = "LV", "BV", "SV"
 SPEED_MPS = 25.0
 FAILS = "fails when it is tried before a cut-in"
+DRIVES = "setSpeed", "slowDown", "setAcceleration"
+NEVER_DRIVES = "gives no speed or acceleration, in ten seconds in which a car cuts in, to"
 
 
 def script_maker(av: AutomatedVehicle, guard: Guard) -> Callable[[], ScriptController]:
@@ -44,17 +47,22 @@ def script_maker(av: AutomatedVehicle, guard: Guard) -> Callable[[], ScriptContr
     if (ego := style.ego) is None:
         with guard:
             answer, late = guard.call(_found, script, makes=True)
-        ego, wrong, _ = answer or (None, f"{FAILS}: {late}", 0.0)
+        ego, wrong = answer[:2] if answer else (None, f"{FAILS}: {late}")
     else:
         wrong = f"calls its vehicle {ego}, as one of the others is called" if ego in OTHERS else ""
     if wrong or ego is None:
         found = f"{name}, which {wrong}"
         expected, mend = "a script that commands one vehicle", "Name its vehicle: --set av.traci_style.ego=NAME."
+        if wrong.startswith(NEVER_DRIVES):
+            mend = "A test is one run of it from its first line: leave out steps that only wait. If it drives later, "
+            mend += f"--set av.traci_style.ego={ego}."
         if wrong.startswith(FAILS):
-            expected = "a script of calls that docs/controllers.md has (“How it differs from TraCI”)"
+            expected = "a script that gets through a cut-in"
             other = " If it asks for other vehicles, add --set av.traci_style.ego=NAME."
             lacking = list(_lacking(name))
-            mend = f"Take out, or replace, {', '.join(lacking)}." if lacking else "Fix the script in that line."
+            mend = "Fix the script in that line."
+            if lacking:
+                mend = f"Take out, or replace, {', '.join(lacking)}: docs/controllers.md has the calls that are there."
             mend += other if "is not known" in wrong else ""
         raise CampaignError("av.controller", found, expected, mend)
 
@@ -110,28 +118,43 @@ class _Anybody(dict[str, SeenVehicle]):
 
 
 class _Tried(VehicleDomain):
-    """Notes which vehicles a script commands, and the ``hardest`` braking (m/s²) that its vehicle's type bounds."""
+    """Notes what a script does.
+
+    Which vehicles it commands, whether it ``drives``, its ``hardest`` braking (m/s²) that its vehicle's type bounds,
+    infinite where a speed mode lets nothing bound it, and how many steps it is ``idle``, looking at no vehicle.
+    """
 
     def __init__(self, ego: str) -> None:
         super().__init__(SPEED_MPS, ego)
-        self.commanded, self.hardest = dict[str, None](), 0.0
+        self.commanded, self.hardest, self.drives = dict[str, None](), 0.0, False
+        self.idle, self._looks = -2, False  # the first step is seen at the start, the second after a step
         if isinstance(ego, _AnyName):
             self._seen = _Anybody(self._seen, ego)
 
     def next_acceleration(self) -> float:
         acceleration = super().next_acceleration()
-        if self._speed_mode & DECEL and math.isinf(self._decel):  # no bound of its own
-            self.hardest = max(self.hardest, -acceleration)
+        if math.isinf(self._decel) and acceleration < 0.0:  # no bound of its own
+            self.hardest = max(self.hardest, -acceleration if self._speed_mode & DECEL else math.inf)
         return acceleration
+
+    def see(self, now: Observation) -> None:
+        super().see(now)
+        self._looks = self._looks and self.idle >= 0  # what comes before a step is no look
+        self.idle += not self._looks
+
+    def _of(self, vehID: str) -> SeenVehicle:
+        self._looks = True
+        return super()._of(vehID)
 
     def _require_own(self, vehID: str, name: str, why: str = "") -> None:  # noqa: ARG002
         self._of(vehID)
         if name[:3] != "get":
             self.commanded[vehID] = None
+        self.drives |= name in DRIVES
 
 
-def _found(script: TraciScript) -> tuple[str | None, str, float]:
-    """Name of the one vehicle that a script commands, or what is wrong with it; and its hardest braking (`_Tried`).
+def _found(script: TraciScript) -> tuple[str | None, str, _Tried]:
+    """Name of the one vehicle that a script commands, or what is wrong with it; and what else it did.
 
     Names are first taken as they come, each for the AV; those that came are then tried, one after the other.
     """
@@ -145,28 +168,29 @@ def _found(script: TraciScript) -> tuple[str | None, str, float]:
             named = list(tried.commanded)
             wrong.insert(-1, failed)
         if len(named) > 1:
-            return None, f"commands {' and '.join(named)}", 0.0
+            return None, f"commands {' and '.join(named)}", tried
         if named == [name] and not failed:
-            return name, "", tried.hardest
+            return name, "" if tried.drives else f"{NEVER_DRIVES} {name}", tried
     why = next(filter(None, wrong), "")
-    return None, f"{FAILS}: {why}" if why else "commands no vehicle before a cut-in", 0.0
+    return None, f"{FAILS}: {why}" if why else "commands no vehicle before a cut-in", tried
 
 
 def _commanded(script: TraciScript, ego: str) -> tuple[_Tried, str]:
     """What a script does when a car cuts in before it; and what it raises."""
     tried = _Tried(ego)
     try:
-        with closing(ScriptController(script, lambda *_: tried)) as controller:
+        # What it prints there is of no test.
+        with redirect_stdout(io.StringIO()), closing(ScriptController(script, lambda *_: tried)) as controller:
             _drive(controller)
     except (Exception, SystemExit) as error:  # noqa: BLE001 - whatever a user's code raises
         return tried, cause_of(error)
     return tried, ""
 
 
-def asked_for(av: AutomatedVehicle) -> tuple[int, float]:
+def asked_for(av: AutomatedVehicle) -> tuple[int, float, int]:
     """Of how many of the harness's steps one of a script's is, as it asks for before its first; 0 where it does not.
 
-    And the hardest braking (m/s²) that it asks for before a cut-in, as far as only its vehicle's type bounds that.
+    And of `_Tried` its hardest braking and idle steps.
     """
     script, ego = TraciScript(str(av.controller), dict(av.parameters)), av.traci_style.ego
     tried = _Tried(ego or _AnyName(VEH_ID))
@@ -175,11 +199,11 @@ def asked_for(av: AutomatedVehicle) -> tuple[int, float]:
         guard.call(_drive, controller, 1, makes=True)
         if ego is None:
             found, _ = guard.call(_found, script, makes=True)
-            hardest = found[-1] if found else 0.0
+            tried = found[-1] if found else tried
         else:
             found, _ = guard.call(_commanded, script, ego, makes=True)
-            hardest = found[0].hardest if found else 0.0
-    return controller.traci.every, hardest
+            tried = found[0] if found else tried
+    return controller.traci.every, tried.hardest, tried.idle
 
 
 def _drive(controller: ScriptController, n_steps: int = 100) -> None:

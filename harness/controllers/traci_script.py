@@ -88,6 +88,15 @@ class _Simulation(SimulationDomain):
     getLoadedIDList, getLoadedNumber = getDepartedIDList, getDepartedNumber
 
 
+class _Lanes(Domain):
+    """``traci.lane``: each has the speed at which the AV cruises for its limit."""
+
+    _path = "traci.lane"
+
+    def __init__(self, vehicles: VehicleDomain) -> None:
+        self.getMaxSpeed = lambda _laneID: vehicles.set_speed_mps
+
+
 class _Routes(Domain):
     """``traci.route``: of the one that its vehicle is added on."""
 
@@ -112,7 +121,7 @@ class ScriptTraci(Traci):
     def __init__(self, vehicle: VehicleDomain) -> None:
         super().__init__()
         self.vehicle, self.simulation = vehicle, _Simulation(vehicle)
-        self.gui, self.route = _Gui(), _Routes()
+        self.gui, self.route, self.lane = _Gui(), _Routes(), _Lanes(vehicle)
         self._listeners: dict[int, Any] = {}
         self._n_listeners = self._n_after = 0
         self.importing = False

@@ -90,7 +90,7 @@ class VehicleDomain(Domain):
     def __init__(
         self, set_speed_mps: float = math.nan, ego: str = VEH_ID, lv_name: str = "LV", bv_name: str = "BV"
     ) -> None:
-        self.legacy_leader = True
+        self.legacy_leader, self.set_speed_mps = True, set_speed_mps
         self._ego = ego
         self._plan: Iterator[float] = iter(())
         """Accelerations (m/s²) of the coming steps; empty without a command."""

@@ -100,7 +100,9 @@ def width_row(campaign: Campaign, best: Estimate, expected: Mapping[str, int] | 
     if not (math.isfinite(whole) and math.isfinite(runs)):
         return
     which = "runs" if 2.0 * runs * runs > whole * whole else "tests"
-    remark = "" if expected is None else f"try {count(expected['runs'])} runs, {count(expected['tests'])} tests"
+    remark = "" if expected is None else f"try stop.episodes={expected['tests']}"
+    if expected is not None and expected["runs"] != campaign.pool.shadow_paths:
+        remark = f"try pool.shadow_paths={expected['runs']}, {count(expected['tests'])} tests"
     alone = f"{count(campaign.pool.shadow_paths)} baseline runs ± {share(runs)}"
     yield Row("width", "precision", f"± {share(whole)}, mostly by {which}", alone, remark)
 

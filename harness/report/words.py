@@ -41,7 +41,6 @@ ENDED = {
     "sum": "with the sum of all scenarios",
 }
 """Why a campaign ended (`harness.vocabulary.StoppedBy`), in words."""
-GO_ON = "; raise it and go on with --resume"
 """What to do where a verdict is open, or the asked precision not reached."""
 
 
@@ -190,8 +189,8 @@ BRAKES_BEFORE = "in {} tests it braked with nobody ahead, which makes cut-ins mi
 
 def late_words(*, script: bool) -> str:
     """That a vehicle does nothing before BV is in its lane, and what would show it."""
-    what = "getLateralLanePosition" if script else "bv_lateral_m"
-    return f"it did nothing before the other car (BV) was in its lane; {what} shows it some 2 s earlier"
+    what = "its getLateralLanePosition < 0" if script else "bv_lateral_m > 0"
+    return f"it did nothing before the other car (BV) was in its lane; {what} shows it 2 s earlier"
 
 
 def cruise_words(did: Sequence[str], *, script: bool) -> str:
@@ -232,13 +231,18 @@ def _scope(campaign: Campaign, manifest: Mapping[str, Any], told: Estimates) -> 
         reached = reached_words(asked, width)
         if not best.n_crashes or best.cautions:
             reached = ", precision not known" if best.n_crashes else ", no crash seen"
-        more = GO_ON if stopped_by == "episodes" else remedy_words(manifest.get("remedy"))
+        more = go_on(best.n_episodes) if stopped_by == "episodes" else remedy_words(manifest.get("remedy"))
         ended += f"{reached} (asked: ± {share(target)}){more}"
     elif stopped_by == "episodes":
-        ended = "all tests done" if campaign.accept is None else ended + GO_ON
+        ended = "all tests done" if campaign.accept is None else ended + go_on(best.n_episodes)
     elif stopped_by in ("rhw", "below_reference") and (given := campaign.testing.shells.statement) != ASSUMPTION_FREE:
         ended += f", given the {given}"
     return scope_words(best.confidence, ended)
+
+
+def go_on(n: int) -> str:
+    """How a run goes on whose budget of ``n`` tests is used up."""
+    return f"; go on with --resume --set stop.episodes={2 * n}"
 
 
 def reached_words(rhw: float, width: str) -> str:

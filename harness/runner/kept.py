@@ -309,7 +309,7 @@ def require_own_folder(folder: Path, resolved: Resolved, *, resume: bool) -> dic
         return nothing
     if manifest.get("controller_sha256") != resolved.controller_sha256:
         found = "tests of this campaign; since then its controller, or a file that it is made of, has been changed"
-        mend = "A corrected controller needs a new --out; to compare, put the old one back, under another name, as A."
+        mend = "Give a corrected vehicle a new --out. To compare with the old version, bring that back as another file."
         raise refusal(found, "the same controller for all tests of a run", mend)
     if not resume:
         mend = "Continue it with --resume, or choose another folder with --out."

@@ -111,6 +111,10 @@ NEVER_STEPS = "import traci\ntraci.start(['sumo'])\ntraci.vehicle.setSpeedMode('
 ENDLESS = "import traci\ntraci.vehicle.setSpeedMode('ego', 0)\nwhile True:\n    try:\n        traci.simulationStep()\n"
 AT_THE_DOOR = {
     "commands no vehicle": text("traci.vehicle.getSpeed('ego')"),
+    r"no speed or acceleration, .* a car cuts in, to ego.*leave out steps that only wait": text(
+        "traci.vehicle.setSpeed('ego', 20.0)",
+        LOOP.replace("while", "traci.vehicle.add('ego', 'r')\nfor _ in range(200): traci.simulationStep()\nwhile"),
+    ),
     "commands ego and LV": text("traci.vehicle.setSpeed('ego', 20.0); traci.vehicle.setSpeed('LV', 20.0)"),
     "never calls simulationStep": NEVER_STEPS,
     r"ZeroDivisionError: division by zero \(my.py:7\)": text("traci.vehicle.setSpeed('ego', 1 / 0)"),
@@ -135,7 +139,7 @@ AT_THE_DOOR = {
     r"traci.vehicle has no getEmissionClass here: delete the line, or put in a value of your own \(my.py:7\)$": text(
         "traci.vehicle.setSpeed('ego', 9.0); traci.vehicle.getEmissionClass('ego')"
     ),
-    r"Take out, or replace, vehicle.moveTo \(line 7\), edge.getIDList \(line 9\)\.": text(
+    r"Take out, or replace, vehicle.moveTo \(line 7\), edge.getIDList \(line 9\): docs": text(
         "traci.vehicle.setSpeed('ego', 9.0); traci.vehicle.moveTo('ego', 'e0_0', 1.0)\n\n    traci.edge.getIDList()"
     ),
     "'truck' is not known, or not seen yet: there are LV, BV, ego": text(
@@ -263,7 +267,19 @@ def test_a_script_that_bounds_its_braking_itself_is_told_nothing_of_its_type(bou
     (tmp_path / "my.py").write_text(body.replace("traci.vehicle.setSpeed('ego', 20.0)", own), "utf-8")
     overrides = ["av.traci_style.decel_mps2=4.5"] if bound == "given" else []
     assert script_step_s(load_campaign(str(tmp_path / "my.py"), overrides).av) == 0.1
-    assert not capsys.readouterr().err
+    told, loose = capsys.readouterr().err, "note: my.py sets a speed mode in which no decel bounds its braking"
+    assert told.startswith(loose) if "SpeedMode" in bound else not told
+
+
+@pytest.mark.parametrize(("steps", "told"), [(0, ""), (11, ""), (12, "looks at no vehicle in the first 1.1 s")])
+def test_a_script_that_first_waits_is_told_that_each_test_begins_with_its_first_line(steps, told, tmp_path, capsys):
+    waits = f"traci.vehicle.add('ego', 'r')\nfor _ in range({steps}): traci.simulationStep()\nwhile"
+    keeps = "traci.vehicle.setSpeed('ego', traci.lane.getMaxSpeed(traci.vehicle.getLaneID('ego')))"
+    body = text(keeps, LOOP.replace("while", waits)).replace('"sumo"', '"sumo", "--step-length", "0.1"')
+    (tmp_path / f"my{steps}.py").write_text(body, "utf-8")
+    assert script_step_s(load_campaign(str(tmp_path / f"my{steps}.py")).av) == 0.1
+    assert told in (said := capsys.readouterr().err)
+    assert bool(told) == bool(said)
 
 
 def test_a_stored_answer_is_the_same_when_the_script_has_gone_or_is_broken(tmp_path):
@@ -272,7 +288,7 @@ def test_a_stored_answer_is_the_same_when_the_script_has_gone_or_is_broken(tmp_p
     run_here(load_campaign(f"{file}", asked), tmp_path / "run")
     told = answer_in(tmp_path / "run")
     assert told["parameters"] == [["type", "accel 2.6, decel 4.5 m/s²"], ["step", "1 s"]]
-    assert "getLateralLanePosition shows it" in "".join(told["warnings"])
+    assert "its getLateralLanePosition < 0 shows it" in "".join(told["warnings"])
     file.write_bytes(b"\xff")
     assert answer_in(tmp_path / "run") == told
     file.unlink()

@@ -116,7 +116,7 @@ def test_another_version_of_the_controller_is_refused(module, named, imports, tm
         each.write_text(text.replace("2.0", "3.0") + "\n")
         with pytest.raises(RunFolderError, match="made of, has been changed") as refused:
             run_here(golden("forced-twin", *settings, "stop.episodes=40"), out, resume=True)
-        assert "put the old one back, under another name" in refused.value.mend  # as docs/compare.md says
+        assert "bring that back as another file" in refused.value.mend  # as docs/compare.md says
         each.write_text(text)
     assert run_here(golden("forced-twin", *settings, "stop.episodes=40"), out, resume=True).exit_code == 0
 
