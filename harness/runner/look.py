@@ -73,9 +73,9 @@ def check_av(campaign: Campaign | str | Path, n_episodes: AtLeastTwo = EPISODES)
     own = tested.av.limits if isinstance(tested.av.parameters, dict) else tested.av.parameters
     limits = own.min_acceleration_mps2, own.max_acceleration_mps2
     if script := is_script(tested.av.controller or ""):  # clipped by its type's, see docs/controllers.md
-        a, of_type = np.concatenate([trace[:-1, -1, 2] for trace in first.traces.values()]), tested.av.traci_style
-        lowest, highest = np.fmin.reduce(a, initial=-of_type.decel_mps2), np.fmax.reduce(a, initial=of_type.accel_mps2)
-        limits = float(lowest), float(highest)  # it may have set others, or a speed mode without
+        a = np.concatenate([[], *(trace[:-1, -1, 2] for trace in first.traces.values())])  # it may have set others
+        low, high = -tested.av.traci_style.decel_mps2, tested.av.traci_style.accel_mps2
+        limits = float(np.fmin.reduce(a, initial=low)), float(np.fmax.reduce(a, initial=high))
     differing = tuple(i for i in range(n_episodes) if bits_of(first, i) != again[i])
     cause, clock_read_at = _likely_cause(source, differing[0]) if differing else (None, ())
     family = source.resolved.family
