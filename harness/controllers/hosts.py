@@ -51,13 +51,15 @@ BeforeTest = Callable[[int], str | None]
 def time_limit(limits: Limits, *, makes: bool) -> tuple[float, str]:
     """Of a constructor or of any other call: seconds, and the cause where they are over."""
     key = "construction_time_s" if makes else "step_time_s"
-    return getattr(limits, key), f"no answer within {getattr(limits, key):g} s (av.limits.{key})"
+    seconds: float = getattr(limits, key)
+    return seconds, f"no answer within {seconds:g} s (av.limits.{key})"
 
 
 def death_cause(exit_code: int | None, limits: Limits) -> str:
     """Cause for the record of an episode whose controller took the process along."""
     if exit_code in HUNG_EXIT_CODES:
-        return f"{time_limit(limits, makes=exit_code == HUNG_EXIT_CODES[1])[1]}, and the call could not be interrupted"
+        _, late = time_limit(limits, makes=exit_code == HUNG_EXIT_CODES[True])
+        return f"{late}, and the call could not be interrupted"
     if exit_code == CLOSED_PIPE_EXIT_CODE:
         return "the controller closed file descriptors that are not its own (os.close, os.closerange)"
     if exit_code == -signal.SIGSTOP:
@@ -150,7 +152,6 @@ class Guard:
         One that ``makes`` a controller has a time limit of its own.
         """
         Guard.n_calls += 1
-        since = monotonic()
         try:
             self.limit(makes=makes)
             answer = function(*arguments)
@@ -164,9 +165,9 @@ class Guard:
             self.modes.restored()
             return None, cause_of(error)
         finally:
-            self._since = math.nan  # the timer itself is set again by the next call
             if makes:
-                self.construction_s.append(monotonic() - since)
+                self.construction_s.append(monotonic() - self._since)
+            self._since = math.nan  # the timer itself is set again by the next call
             if os.getpid() != self._pid:  # a copy that the controller has made of the process
                 os._exit(0)
 

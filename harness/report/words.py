@@ -190,7 +190,7 @@ BRAKES_BEFORE = "in {} tests it braked with nobody ahead, which makes cut-ins mi
 def late_words(*, script: bool) -> str:
     """That a vehicle does nothing before BV is in its lane, and what would show it."""
     what = "its getLateralLanePosition < 0" if script else "bv_lateral_m > 0"
-    return f"it did nothing before the other car (BV) was in its lane; {what} shows it 2 s earlier"
+    return f"it did nothing before the other car (BV) was in its lane; {what} shows it ~2 s earlier"
 
 
 def cruise_words(did: Sequence[str], *, script: bool) -> str:
