@@ -55,7 +55,8 @@ def pool(resolved):
     return {key: of.tobytes() for key, of in found if isinstance(of, np.ndarray) and key != "mu_covariance"}
 
 
-@pytest.mark.parametrize("scenario", ["cut_in", *(pytest.param(x, marks=pytest.mark.slow) for x in R157[1:])])
+@pytest.mark.slow
+@pytest.mark.parametrize("scenario", R157)
 def test_another_processor_makes_the_same_tests(scenario, monkeypatch):
     """Whatever numpy makes of the last digit; were these off by that, tests would be others."""
     here = resolved_of(scenario)

@@ -171,7 +171,7 @@ def ratio_texts(found: Mapping[str, Any], *, wide: bool, from_below: bool, softe
         return f"< {most}", "no crash seen"
     if wide and (high < 1.0 or (low <= 1.0 and not from_below and high < math.inf)):  # as the row of the rate
         apart = less if high < 1.0 else "not told apart"
-        return f"< {most} ({apart})", f"estimate {ratio(seen)}, ≥ {ratio(low)}"
+        return f"< {most} ({apart})", f"estimate {ratio(seen)}, {ratio(low)} to {most}"
     if from_below and low > 1.0:
         return f"> {ratio(low)} (crashes more)", f"estimate {ratio(seen)}"
     apart = "not told apart" if low <= 1.0 <= high else "crashes more" if low > 1.0 else less

@@ -150,6 +150,7 @@ def test_one_that_crashes_without_an_event_is_told_so_and_not_accepted(tmp_path,
     assert estimates["decision"]["high"] < 0.9
 
 
+@pytest.mark.slow
 def test_one_that_makes_the_events_milder_itself_is_told_so_and_not_accepted(tmp_path, capsys):
     """By falling behind the vehicle ahead: beside the competent driver, too, that is said at once."""
     out, _, code = gate(tmp_path, "tests.families.test_controllers:Lags", "lead_brakes")

@@ -56,8 +56,10 @@ RUNS = {
     **{name: (*sets, "world.engine=twin") for name, sets in IN_THE_TWIN.items()},
     **IN_SUMO,
 }
-LONG = {"mixture-hold-0.1", "step-immediate", "step-immediate-twin", "step-immediate-sumo"}
-"""For .ci/full: their tables take 40 and 50 s of a core."""
+ACT_OR_FAIL = [f"{method}-{kind}" for method in ("forced", "shells") for kind in ("acting", "failing")]
+LONG = {"mixture-hold-0.1", *(f"step-immediate{of}" for of in ("", "-twin", "-sumo"))}
+LONG |= {*ACT_OR_FAIL, *(f"{name}-sumo" for name in ACT_OR_FAIL)}
+"""For .ci/full: tables that take 40 and 50 s of a core, and in SUMO what is run in the twin."""
 
 
 def quick(names):

@@ -101,7 +101,7 @@ def test_what_a_vehicle_of_the_users_own_did_while_bv_came_over_is_warned_of(nam
     ("seen", "high", "first", "value", "ends"),
     [
         (0.0, 0.2, "ratio", "< 0.20", "no crash seen"),
-        (0.08, 0.2, "ratio", "< 0.20 (crashes less)", "estimate 0.080, ≥ 0.050"),
+        (0.08, 0.2, "ratio", "< 0.20 (crashes less)", "estimate 0.080, 0.050 to 0.20"),
         (0.08, 3.0, "rate", "< 3.00 × 10⁻⁸ per test", "estimate 1.00 × 10⁻⁹"),
     ],
 )
