@@ -108,6 +108,7 @@ def test_wrong_calls_end_with_2(capsys, arguments):
         ("run --html page.html", "the page is DIR/report.html"),
         ("compare --resume", "the same command with the same --out goes on"),
         ("run --accept", "Write --accept RATE|DRIVER."),
+        ("compare", "Write harness compare idm OTHER_AV, or say with --against"),
     ],
 )
 def test_what_is_no_option_or_has_no_value_is_told_with_what_to_write(asked, fix, tmp_path, capsys):

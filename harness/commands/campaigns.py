@@ -248,7 +248,8 @@ def compare(
     Exit code 5: B is worse than A by more than --margin; 4: tests or pool were used up before that was known.
     """
     if file_b is None and not against and against_av is None:
-        raise click.UsageError("Name a second campaign, or say with --against or --against-av how B differs.")
+        mend = f"Write harness compare {source_a} OTHER_AV, or say with --against SETTING=VALUE how B differs."
+        raise HarnessError("harness compare", f"{source_a} alone", "two vehicles, or campaigns", mend)
     from harness.campaign.files import names_a_campaign
     from harness.campaign.models import parse_override
     from harness.report.words import vehicle_words
