@@ -28,6 +28,6 @@ class ShownInPython:
         return "\n".join(self._lines())
 
     def _repr_html_(self) -> str:
-        from harness.report.page import shown_with  # noqa: PLC0415 - see above
+        from harness.report.drawing import shown_with  # noqa: PLC0415 - see above
 
         return shown_with(repr(self), self._plot())

@@ -13,8 +13,7 @@ from harness.campaign.drivers import default_surrogates
 from harness.campaign.vehicle import AV_SOURCES, with_another_driver
 from harness.campaign.yaml_text import Lines, YamlPath, dotted, parse_value, read_yaml
 from harness.errors import CampaignError
-from harness.families import R157
-from harness.problems import MOST_SHOWN, describe_found, did_you_mean, in_words, listed
+from harness.problems import MOST_SHOWN, describe_found, did_you_mean, in_words
 
 Model = TypeVar("Model", bound=BaseModel)
 
@@ -44,7 +43,7 @@ def validated(data: dict[str, Any], model: type[Model], place: Places) -> Model:
                 belongs = f"'{where[-1]}' belongs under {' or '.join(places)}."
                 mend = belongs if places else "Delete it, or correct its name."
             elif mend[0] in "{[":  # what to write
-                mend = f"Write {where[-1]}: {mend.replace('[all]', f'[{listed(R157)}]')}."
+                mend = f"Write {where[-1]}: {mend.replace('[all]', '[cut_in, lead_brakes, cut_out]')}."
             problems[where, found] = CampaignError(place(where), found, expected, mend)
     first, *more = problems.values()
     if not more:

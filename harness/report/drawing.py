@@ -6,9 +6,12 @@ Colours are names of the page's CSS variables, and follow its light or dark sche
 
 from __future__ import annotations
 
+import base64
 import math
+import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -229,3 +232,16 @@ def _style(mark: Mark) -> str:
 def _swatch(mark: Mark) -> str:
     form = {"line": "M0 0h15", "dots": "M4 0a4 4 0 1 0 8 0a4 4 0 1 0 -8 0"}.get(mark.kind, "M1 -5h14v10h-14z")
     return f'<path style="{_style(mark)}" d="{form}"/>'
+
+
+def style_of_plots() -> str:
+    """What the page's style sheet says of plots."""
+    css = (Path(__file__).parent / "report.css").read_text(encoding="utf-8")
+    return "".join(re.findall(r"^:root \{.*?^\}$|^\.panel.*?$", css, flags=re.DOTALL | re.MULTILINE))
+
+
+def shown_with(text: str, plot: Plot | None) -> str:
+    """HTML of a text with a plot below it, as a notebook shows results: the plot keeps its style to itself."""
+    image = "" if plot is None else base64.b64encode(plot.file(style_of_plots())).decode()
+    shown = f'<img width="440" alt="{plot.alt}" src="data:image/svg+xml;base64,{image}">' if plot else ""
+    return f"<pre>{escape(text)}</pre>{shown}"

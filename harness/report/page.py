@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import base64
 import re
 from collections.abc import Iterable, Sequence
-from html import escape
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +13,7 @@ from harness.numbers import count, leaves
 from harness.records.folder import SENSITIVITY, read_as, write_bytes
 from harness.report import several
 from harness.report.crashes import Replay, crash_gallery, crashing_pairs, scenes_of, shown_of
-from harness.report.drawing import Plot
+from harness.report.drawing import Plot, style_of_plots
 from harness.report.plots import convergence_plot, sensitivity_plot, severity_plot, shells_plot, where_plot
 from harness.report.summary import RunFolder, RunSummary, lateral_facts, summarise, typed
 from harness.report.templates import write_page
@@ -96,13 +94,6 @@ def _write_comparison(
     )  # fmt: skip
 
 
-def shown_with(text: str, plot: Plot | None) -> str:
-    """HTML of a text with a plot below it, as a notebook shows results: the plot keeps its style to itself."""
-    image = "" if plot is None else base64.b64encode(plot.file(_style())).decode()
-    shown = f'<img width="440" alt="{plot.alt}" src="data:image/svg+xml;base64,{image}">' if plot else ""
-    return f"<pre>{escape(text)}</pre>{shown}"
-
-
 def _plots(run: RunFolder, summary: RunSummary) -> list[Plot]:
     plots = [
         severity_plot(run.estimates),
@@ -122,15 +113,9 @@ def _sensitivity(folder: Path, known_by: str, typed: str) -> Plot | None:
     return sensitivity_plot(found) if found.campaign_hash == known_by and found.shown else None
 
 
-def _style() -> str:
-    """What the page's style sheet says of plots."""
-    css = (Path(__file__).parent / "report.css").read_text(encoding="utf-8")
-    return "".join(re.findall(r"^:root \{.*?^\}$|^\.panel.*?$", css, flags=re.DOTALL | re.MULTILINE))
-
-
 def _write_plots(folder: Path, plots: list[Plot]) -> None:
     folder.mkdir(exist_ok=True)
-    files = {f"{plot.name}.svg": plot.file(_style()) for plot in plots}
+    files = {f"{plot.name}.svg": plot.file(style_of_plots()) for plot in plots}
     for name, content in files.items():
         write_bytes(folder / name, content)
     for old in folder.iterdir():
