@@ -48,6 +48,7 @@ from harness.resolved import Resolved
 from harness.runner.workers import ShardResult
 from harness.sampling.paths import BaselineResult
 from harness.sampling.protocol import ShardRequest, Source
+from harness.vocabulary import FAMILIES
 
 SMALLEST_FAILED_SAMPLE = 200
 """Episodes before the share of failures can end a campaign."""
@@ -299,7 +300,8 @@ def require_own_folder(folder: Path, resolved: Resolved, *, resume: bool) -> dic
     elsewhere = "Choose another folder with --out."
     if not (folder / MANIFEST).exists():
         expected = "a new or empty folder, or one that a run has left"
-        raise refusal("a folder with other files", expected, elsewhere)
+        several = (folder / FAMILIES).exists()
+        raise refusal("a run of several scenarios" if several else "a folder with other files", expected, elsewhere)
     manifest = read_manifest(folder, mend=elsewhere)
     if manifest["campaign_hash"] != resolved.content_hash:
         found = f"another campaign ({manifest.get('name')}, {manifest['campaign_hash']})"

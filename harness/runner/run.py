@@ -19,7 +19,7 @@ import numpy as np
 
 from harness.arguments import AtLeastOne, checked
 from harness.campaign.campaign import Campaign
-from harness.campaign.files import campaign_of, dump_campaign
+from harness.campaign.files import campaign_of, dump_campaign, load_campaign
 from harness.errors import CampaignError, RunFolderError, told_of
 from harness.estimators.answer import Estimates, ended_by
 from harness.estimators.estimate import finite_json
@@ -28,6 +28,7 @@ from harness.estimators.shells import SeenShells
 from harness.estimators.stopping import Decision, RoundRule
 from harness.families.protocol import Exposure
 from harness.printed import PRINTED
+from harness.problems import listed
 from harness.progress import Progress
 from harness.records.folder import CAMPAIGN, SENSITIVITY, sole_use, write_bytes, write_sealed
 from harness.report.words import doubts_of, vehicle_words
@@ -125,6 +126,9 @@ def run_families(campaign: Campaign, out: Path, *, workers: int | None, resume: 
         held.enter_context(sole_use(out))
         require_no_other(out, [*names, FAMILIES, CAMPAIGN])
         places = held.enter_context(taken({out / name: each for name, each in ready.items()}, resume=resume))
+        began -= max(float(earlier.get("wall_time_s") or 0.0) for _, earlier in places.values())
+        if any(earlier["n_episodes"] for _, earlier in places.values()):
+            require_same_shares(out, campaign)
         yaml = dump_campaign(campaign).encode()
         write_bytes(out / CAMPAIGN, yaml)
         hour, results, decision = _run(campaign, places, rule, workers, progress)
@@ -216,6 +220,21 @@ def require_same_driver(campaign: Campaign, ready: Mapping[str, Resolved]) -> No
             expected = f"{first}, the first reference driver of {name}: the sum is held against that of each scenario"
             mend = f"Write {first}, or one scenario."
             raise CampaignError("accept.times_reference.driver", f"'{asked}'", expected, mend)
+
+
+def require_same_shares(out: Path, campaign: Campaign) -> None:
+    """Refuse (`RunFolderError`) to go on where other tests would have been run: by exposures they are allocated."""
+    was, elsewhere = load_campaign(out / CAMPAIGN, check_files=False), "choose another folder with --out."
+    then, now = ([f"{name}={of:g}" for name, of in each.exposure.items()] for each in (was, campaign))
+    if sorted(then) != sorted(now):
+        found, expected = (f"exposure {', '.join(each) or 'as shipped'}" for each in (then, now))
+        options = "".join(f" --exposure {each}" for each in now)
+        mend = f"Without new tests: harness estimate {out}{options}. Or {elsewhere}"
+        raise RunFolderError(str(out), f"tests allocated with {found}", expected, mend)
+    if (was.scenarios, was.stop.each_family) != (campaign.scenarios, campaign.stop.each_family):
+        found = f"tests of {listed(was.scenarios or ())}, each_family: {was.stop.each_family}"
+        expected = f"tests of {listed(campaign.scenarios or ())}, each_family: {campaign.stop.each_family}"
+        raise RunFolderError(str(out), found, expected, elsewhere.capitalize())
 
 
 def require_no_other(out: Path, names: Sequence[str]) -> None:

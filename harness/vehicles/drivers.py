@@ -49,7 +49,8 @@ class Followers(NamedTuple):
 def driver_dtype() -> np.dtype[np.void]:
     """All parameters of all models, and how a driver lags behind; 0 where one has none, NaN for natural headways."""
     derived = "reaction_steps", "used_up_steps", "max_jerk_mps3", "inattention_probability", "perceives_lateral_m"
-    numbers = dict.fromkeys(chain(*(model.model_fields for model in get_args(BuiltInParameters)), derived))
+    own = (model.model_fields for model in get_args(BuiltInParameters))
+    numbers = dict.fromkeys(chain(*own, derived, ("twice_root_mps2",)))
     whole = "kind", "delay_steps", "inattention_steps", "cruises"
     return np.dtype([(name, np.int64) for name in whole] + [(name, np.float64) for name in numbers])
 
@@ -71,6 +72,8 @@ def driver_records(
             value = getattr(driver, name, record[name])
             record[name] = math.nan if value == NATURAL else value
         record["reaction_steps"] = 10.0 * record["reaction_time_s"]
+        squared = record["acceleration_mps2"] * record["comfortable_deceleration_mps2"]
+        record["twice_root_mps2"] = 2.0 * math.sqrt(squared)  # here, as a root takes kernels long
         record["max_jerk_mps3"] = math.inf if reaction.max_jerk_mps3 is None else reaction.max_jerk_mps3
         record["perceives_lateral_m"] = reaction.perceives_lateral_m
         record["delay_steps"] = round(reaction.delay_s * 10.0)
@@ -98,8 +101,8 @@ def idm_acceleration(driver: Record, headway_s: float, speed: float, lead_speed:
 
     a = α [1 − (v/v0)⁴ − (s*/s)²], s* = s0 + max(0, v T + v (v − v_lead)/(2 √(α b))).
     """
-    braking = 2.0 * math.sqrt(driver.acceleration_mps2 * driver.comfortable_deceleration_mps2)
-    desired = driver.minimum_gap_m + max(0.0, speed * headway_s + (speed * (speed - lead_speed)) / braking)
+    closing = (speed * (speed - lead_speed)) / driver.twice_root_mps2
+    desired = driver.minimum_gap_m + max(0.0, speed * headway_s + closing)
     ratio = speed / driver.desired_speed_mps
     squared = ratio * ratio
     close = desired / gap

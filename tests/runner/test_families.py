@@ -103,6 +103,25 @@ def test_workers_and_interruptions_change_no_bit(run, tmp_path):
         harness.run(campaign(), out)
 
 
+@pytest.mark.parametrize(
+    ("other", "told"),
+    [
+        (
+            ["exposure.cut_out=0.01"],
+            r"exposure as shipped; expected exposure cut_out=0\.01\. Without .*cut_out=0\.01\. Or",
+        ),
+        (["scenarios=[lead_brakes, cut_in, cut_out]"], "tests of cut_in, lead_brakes, cut_out"),
+        (["stop.each_family=true"], "each_family: False; expected .*each_family: True"),
+        (["scenario=cut_in", "scenarios=null"], "a run of several scenarios"),
+    ],
+)
+def test_what_would_allocate_other_tests_is_refused_before_one_is_run(run, other, told):
+    kept = {file: file.read_bytes() for file in run.folder.rglob("*") if file.is_file()}
+    with pytest.raises(RunFolderError, match=told):
+        harness.run(campaign("stop.rhw=0.5", *other), run.folder, resume=True)
+    assert {file: file.read_bytes() for file in run.folder.rglob("*") if file.is_file()} == kept
+
+
 @pytest.mark.slow
 def test_a_precision_of_each_family_can_be_asked_for(tmp_path):
     """That of the one which is known worst takes most tests."""
