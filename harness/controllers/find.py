@@ -255,14 +255,17 @@ def _made(make: Callable[[], Any], name: str, guard: Guard) -> Any:
     if wrong is not None or controller is None:
         raise _not_made(name, wrong or "it returns None (is a return missing?)")
     _require_controller(controller, name)
-    method = "step_batch" if _is_batch(controller) else "step"
-    with suppress(ValueError):  # one in C may have no signature
-        takes = signature(getattr(controller, method))
-        try:
-            takes.bind(None)
-        except TypeError as error:
-            found, expected = f"{name}, whose {method} takes {takes} ({error})", f"{method}(self, seen)"
-            raise CampaignError("av.controller", found, expected, f"Write def {expected}: in it.") from error
+    batch = {"step_batch": "seen", "start_batch": "cells, episodes, random"}
+    for method, given in (batch if _is_batch(controller) else {"step": "seen", "start": "episode"}).items():
+        if not callable(made := getattr(controller, method, None)):
+            continue  # step is there, others need not be
+        with suppress(ValueError):  # one in C may have no signature
+            takes = signature(made)
+            try:
+                takes.bind(*given.split(","))
+            except TypeError as error:
+                found, expected = f"{name}, whose {method} takes {takes} ({error})", f"{method}(self, {given})"
+                raise CampaignError("av.controller", found, expected, f"Write def {expected}: in it.") from error
     return controller
 
 

@@ -75,9 +75,9 @@ def rows_of(campaign: Campaign, manifest: Mapping[str, Any], told: Estimates) ->
     yield from reversed(rows) if unseen or (wide and beside and end(beside[0]["ratio_high"]) < 1.0) else rows
     if not beside and campaign.has_baseline_runs and "shells" in best.details and not best.cautions:
         yield Row("ratio", "× competent driver", "no ratio", "", "that driver never crashes here")
-    if assumed is not None and (others := looking_words(assumed)):
-        ends = MISSING if from_below else f"up to {number(assumed.most * high)}"
-        yield Row("assumed", "in other traffic", f"up to {number(assumed.most, 2)} times", ends, f"if {others}")
+    if assumed is not None and (others := looking_words(assumed)) and not from_below:
+        most, ends = f"up to {number(assumed.most, 2)} times", f"up to {number(assumed.most * high)}"
+        yield Row("assumed", "in other traffic", most, ends, f"if {others}")
     if campaign.has_baseline_runs and best.n_crashes:
         yield from width_row(campaign, best, manifest.get("expected"))
     if told.severity is not None:

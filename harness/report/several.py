@@ -212,6 +212,8 @@ def deciding_words(content: Mapping[str, Any], s_per_pair: float | None = None) 
         return None
     if decision["margin"] and (decision["n_milder"] or decision["n_differing"]):  # which no more pairs would mend
         return None
+    if not content["n_only_a"] + content["n_only_b"]:
+        return "in no pair of tests did they differ"
     if (needed := content["to_decide"]) is None:
         return "how many pairs would decide is not known: so far the two are too alike"
     where, pairs, done = (

@@ -124,7 +124,7 @@ def doubts_of(campaign: Campaign, manifest: Mapping[str, Any], told: Estimates, 
         EARLY: n_left_out(campaign, told.diagnostics.get(EARLY, 0)), "milder": told.milder,
         "if_failed_had_crashed": times * best.details["crash_rate_if_failed_had_crashed"],
         "cut_off": times * told.cut_off, "cut_off_test": told.cut_off_test,
-        "cautions": best.cautions, "repeated": manifest.get("repeated"),
+        "cautions": best.cautions, "repeated": manifest.get("repeated"), "failure": manifest.get("failure"),
         "share_below_1_mps": None if severity is None else severity.share_below_1_mps,
         "assumed": told.assumed, "before_event": before_event(campaign, manifest, told.diagnostics),
     }  # fmt: skip
@@ -154,7 +154,8 @@ def warnings_of(scenario: str, of: Mapping[str, Any], unit: str, but: str = "") 
         yield f"NOT REPRODUCIBLE: {count(n)} of {again} tests that ran twice differed: see `harness av-check`"
     if n := of["n_failed"]:
         tests, had = count(of["n_episodes"]), f"{number(of['if_failed_had_crashed'])}{unit}"
-        yield f"{count(n)} of {tests} tests FAILED; had they all crashed, the rate would be {had}"
+        why = f"; most with: {of['failure']}" if of.get("failure") else ""
+        yield f"{count(n)} of {tests} tests FAILED; had they all crashed, the rate would be {had}{why}"
     worst = of["rate"] + of["cut_off"]
     if worst > max((1.0 + CUT_OFF_SHARE) * of["rate"], of["ci_high"]):
         ended = f"tests, as test {of['cut_off_test']}, ended while the vehicle was still closing in"

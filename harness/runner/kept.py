@@ -222,11 +222,13 @@ class Run:
         """What the manifest says."""
         repeated, campaign, shadow = self.repeated, self.resolved.campaign, self.before.get(SHADOW, ())
         n_failed = sum(len(table) - table["failure"].null_count for table in shadow)
+        failures = by_kind(sum((each.causes for each in self.shown), Counter[str]())).most_common(1)
         return {
             **self.facts,
             "status": status, "stopped_by": None, "unmet": [], "wall_time_s": self.took_s, **of_the_end,
             "reproducible": campaign.av.reproducible and not (repeated and repeated.differing),
             "repeated": None if repeated is None else asdict(repeated),
+            "failure": failures[0][0] if failures else None,  # the most frequent
             "n_episodes": self.n_episodes, "parts": self.parts, "before": self.parts_before,
             **({"shadow_runs": {"n_runs": sum(map(len, shadow)), "n_failed": n_failed}} if shadow else {}),
         }  # fmt: skip

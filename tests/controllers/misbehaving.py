@@ -314,6 +314,15 @@ class StepOfProperty:
     step = property(lambda _: lambda seen: 0.0)
 
 
+class StartOfNothing:
+    """Whose start takes no episode."""
+
+    def start(self): ...
+
+    def step(self, _seen):
+        return 0.0
+
+
 class StepOfNothing:
     """Whose step takes no observation."""
 

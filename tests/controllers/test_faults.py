@@ -224,6 +224,7 @@ REFUSED = [
     (_of("StepMisspelt"), "av.controller", "fix:      Rename stp to step.\n"),
     (_of("StepOfProperty"), "av.controller", "fix:      Write def step(self, seen): return 0.0"),
     (_of("StepOfNothing"), "av.controller", "fix:      Write def step(self, seen): in it.\n"),
+    (_of("StartOfNothing"), "av.controller", "fix:      Write def start(self, episode): in it.\n"),
     (POPEN, "av.controller", "Popen without step"),
 ]
 

@@ -16,7 +16,7 @@ from tests.stored_runs import answer_in, estimates, golden
 SAID = {
     "nde-twin": ["lane_change_level is 3,000,000: compare only with", "impact speed "],
     "step-recursive-twin": ["the true rate may lie far above this interval: a crash may weigh 1.00 × 10²⁰⁰, and all"],
-    "forced-failing-twin": [" of 240 tests FAILED; had they all crashed, the rate would be "],
+    "forced-failing-twin": [" of 240 tests FAILED; had they all crashed, the rate would be ", "; most with: "],
     "shells-twin": ["crash rate  ", "× competent driver  ", "r157-cc, UN R157’s driver", "even by braking at 8 m/s²"],
     "shells-accepted": [
         "ACCEPTED ",
@@ -148,7 +148,7 @@ def test_an_end_that_says_nothing_is_not_shown(stored_run, verdict, untested):
     found = {row.key: row.texts[1:] for row in rows}
     assert found["rate"][:2] == ("> 1.00 × 10⁻⁷ per test", "estimate 2.00 × 10⁻⁷")
     assert found["ratio"][:2] == ("> 2.00 (crashes more)", "estimate 3.98")
-    assert found["assumed"][:2] == ("up to 25 times", "–")  # no gap in the column
+    assert "assumed" not in found
     assert found["impact"][1:] == ("", "0 % (0–41 %) below 1 m/s")
 
 
