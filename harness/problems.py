@@ -88,6 +88,8 @@ def _parts(details: ErrorDetails, section: type[BaseModel]) -> dict[str, str]:
         mend = f"[{value}]" if kind == "list_type" else f"{{NAME: {value}}}"
     elif kind.startswith("less_than") and 0 in context.values():
         mend = f"Write {last}: -{value}."
+    elif kind.startswith("less_than") and max(context.values()) <= 1.0 < value <= 100.0:
+        mend = f"Write {last}: {value / 100.0:g} for {value:g} %."
     return {"key": key, "found": found, "expected": expected, "mend": mend}
 
 

@@ -20,7 +20,7 @@ from harness.vocabulary import MOST_ASKED
     epilog=examples(
         "harness fit trajectories.parquet --out my-traffic.yaml",
         "harness fit 01_tracks.csv 02_tracks.csv --mapping highd --out highway.yaml",
-        "harness run my_av.py:MyAV --set environment.parameters=my-traffic.yaml",
+        "harness run my_av.py:MyAV --set environment.parameters=my-traffic.yaml --out runs/mine",
         "harness estimate runs/mine --environment my-traffic.yaml",
         "harness run my_av.py:MyAV --scenario lead_brakes --set environment.parameters=my-traffic.lead_brakes.yaml",
     ),

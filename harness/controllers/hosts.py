@@ -94,7 +94,7 @@ def _place_of(error: BaseException) -> str:
     """`` (my_av.py:12)``: the last line of the user's code on the way to an error; empty where there is none."""
     places = [(frame.f_code.co_filename, line) for frame, line in walk_tb(error.__traceback__)]
     theirs = [place for place in places if not place[0].startswith((*NOT_THE_USERS, "<"))]
-    own = [place for place in theirs if "site-packages" not in place[0]] or theirs
+    own = [place for place in theirs if place[0].endswith(".py") and "site-packages" not in place[0]] or theirs
     return f" ({Path(own[-1][0]).name}:{own[-1][1]})" if own else ""
 
 

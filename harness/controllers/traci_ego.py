@@ -6,6 +6,7 @@ import ast
 import io
 import math
 import os
+import re
 from collections.abc import Callable, Iterator
 from contextlib import closing, redirect_stdout
 from functools import partial
@@ -59,10 +60,11 @@ def script_maker(av: AutomatedVehicle, guard: Guard) -> Callable[[], ScriptContr
         if wrong.startswith(FAILS):
             expected = "a script that gets through a cut-in"
             other = " If it asks for other vehicles, add --set av.traci_style.ego=NAME."
-            lacking = list(_lacking(name))
-            mend = "Fix the script in that line."
-            if lacking:
-                mend = f"Take out, or replace, {', '.join(lacking)}: docs/controllers.md has the calls that are there."
+            mend, line = "Fix the script in that line.", re.search(r":(\d+)\)", wrong)
+            if lacking := ", ".join(_lacking(name)):
+                mend = f"Take out, or replace, {lacking}: docs/controllers.md has the calls that are there."
+                if line is not None and f"(line {line[1]})" not in lacking:
+                    mend = f"Fix the script in that line. {mend}"
             mend += other if "is not known" in wrong else ""
         raise CampaignError("av.controller", found, expected, mend)
 

@@ -126,6 +126,12 @@ def _reading(path: Path) -> Iterator[None]:
         if "columns, got" in first:
             mend = "Give each row as many values as the header has names. "
             mend += "Decimal commas need semicolons between columns."
+        if (at := re.match(r"In CSV column #(\d+): .*invalid value (.*)", first)) is not None:
+            where, expected = (
+                f"{path}, column {int(at[1]) + 1}",
+                "numbers, with one decimal sign (lane: 0 is the rightmost)",
+            )
+            raise TrajectoryError(where, at[2], expected, "Correct it, or delete the rows that have none.") from None
         raise TrajectoryError(str(path), f"a file that cannot be read ({first})", expected, mend) from None
 
 
@@ -204,6 +210,7 @@ def _columns(path: Path, names: Sequence[str], mapping: Mapping) -> dict[str, st
             known = {} if mapping.columns else {"xvelocity": "highd", "local_y": "ngsim"}
             of = [f"Is it a file for --mapping {known[name]}?" for name in lower if name in known]
             mend = of[0] if of else did_you_mean(wanted, names) or NO_COLUMN[column == "length_m"]
+            mend = "Use the file as published." if mapping.layout == "highd" else mend  # xVelocity is no yVelocity
             what = f"a column {wanted}" + (f" for {column}" if wanted != column else "")
             raise TrajectoryError(str(path), f"the columns {', '.join(names)}", what, mend)
     if mapping.classes and "class" not in found and mapping.layout != "highd":

@@ -188,7 +188,7 @@ def test_what_a_fit_writes_is_what_a_campaign_reads(tmp_path, monkeypatch, capsy
     told = capsys.readouterr().out
     assert "cut_out: 3 cut-outs that reveal a slower vehicle within 12 s in" in told
     assert "at least 5 are needed, some" in told
-    assert "kept is 1.00 per hour [assumed], and the law of cut-out-1" in told
+    assert "kept is 1.00 per hour, in scope or not [assumed], and the law of cut-out-1" in told
     assert "peak_scale_mps2" in told
     page = (tmp_path / "mine.html").read_text()
     assert "lead_brakes: " in page

@@ -130,4 +130,5 @@ class FollowingFitter:
         content: Numbers = {"exposure": {"per_hour": kept.model_dump(exclude_none=True) | seen}} if outside else {}
         excluded = ", which these data exclude" if outside else ""
         told += f" ({limits} per hour); at least {FEWEST_COUNTED} are needed{needed}: kept is {number(kept.value)}"
-        return content, f"{told} per hour [{kept.source}]{excluded}, and the law of {self.family.default_parameters}"
+        told += f" per hour, in scope or not [{kept.source}]{excluded}, and the law of {self.family.default_parameters}"
+        return content, told

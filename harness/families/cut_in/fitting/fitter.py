@@ -190,7 +190,7 @@ class CutInFitter:
         told = [line for each in others.values() for line in each.told]
         shows = page(fit, tally, noise_mps2, asked, told)
         files = {out: text.encode(), shown: shows.encode(), beside: drawn}
-        return Fitted(files, _told(fit, tally, asked.n_replicates), _facts(fit, tally))
+        return Fitted(files, _told(fit, tally, asked), _facts(fit, tally))
 
 
 def _text(fit: Fit, tally: BesideCounts, asked: Asked) -> str:
@@ -205,17 +205,18 @@ def _text(fit: Fit, tally: BesideCounts, asked: Asked) -> str:
     return environment_text(head, fit.environment.model_dump(exclude_defaults=True))
 
 
-def _told(fit: Fit, tally: BesideCounts, n_replicates: int) -> tuple[str, ...]:
+def _told(fit: Fit, tally: BesideCounts, asked: Asked) -> tuple[str, ...]:
     traffic, steps, unseen = fit.traffic, fit.acceptance, fit.environment.unseen
+    side = "left" if asked.read.mirror else "right"
     limited = f"! no lane change seen at {unseen}: rates of crashes that begin there have only an upper limit"
     return (
         f"{traffic.n_recordings:,} recordings, {tally.vehicles:,} vehicles, {tally.driven_s / 3600.0:.2f} h beside the "
-        f"target lane; {tally.used:,} lane changes used of {tally.changes:,}",
+        f"target lane; {tally.used:,} lane changes to the {side} used of {tally.changes:,}",
         f"in front of a vehicle that closes in within 8 s: {int(steps.events[:-1].sum()):,} lane changes; "
         f"{steps.exposure[:-1].sum():.1f} expected if nobody minded it",
         *(f"kept as in {BASE}: {what} ({why})" for what, why in fit.kept.items()),
         *([limited] if unseen else []),
-        *(f"! {words}" for words in too_few(n_replicates, CONFIDENCE)),
+        *(f"! {words}" for words in too_few(asked.n_replicates, CONFIDENCE)),
     )
 
 
