@@ -127,11 +127,8 @@ def _reading(path: Path) -> Iterator[None]:
             mend = "Give each row as many values as the header has names. "
             mend += "Decimal commas need semicolons between columns."
         if (at := re.match(r"In CSV column #(\d+): .*invalid value (.*)", first)) is not None:
-            where, expected = (
-                f"{path}, column {int(at[1]) + 1}",
-                "numbers, with one decimal sign (lane: 0 is the rightmost)",
-            )
-            raise TrajectoryError(where, at[2], expected, "Correct it, or delete the rows that have none.") from None
+            where, mend = f"{path}, column {int(at[1]) + 1}", "Correct it, or delete the rows that have none."
+            raise TrajectoryError(where, at[2], "numbers, of one decimal sign (lane 0: the rightmost)", mend) from None
         raise TrajectoryError(str(path), f"a file that cannot be read ({first})", expected, mend) from None
 
 

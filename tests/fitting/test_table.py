@@ -141,10 +141,7 @@ FILES = {
     "empty.csv": (b"", "an empty file"),
     "ragged.csv": (HEAD + b"1,0,0,30,0,5\n1,0.1,3\n", "as many values as"),
     "comma.csv": (HEAD + b"1,0,0,30,5,0,5\n", "got 7.*Decimal commas"),
-    "both.csv": (
-        b"vehicle_id;time_s;s_m;speed_mps;lane;length_m\n1;0,1;996.58;30,5;0;5\n",
-        r"column 3: found .996\.58.; expected .* one decimal sign",
-    ),
+    "both.csv": (b"vehicle_id;time_s;s_m;speed_mps;lane;length_m\n1;0,1;996.58;30,5;0;5\n", "996.58.; .* decimal sign"),
     "twice.csv": (HEAD[:-1] + b",Lane\n1,0,0,30,0,5,1\n", "more than one column lane"),
     "latin.csv": (HEAD + b"\xfcber,0,0,30,0,5\n", "text in UTF-8"),
     "cut.csv.gz": (gzip.compress(HEAD + random.Random(1).randbytes(9000))[:-2000], "cannot be read"),
