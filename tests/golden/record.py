@@ -29,7 +29,7 @@ GOLDEN = Path(__file__).parent / "golden.json"
 TABLES = {"episodes": ["episode"], "moments": ["episode", "step"], "traces": ["episode", "step"], "shadow": ["shadow"]}
 """By what each is sorted; vehicles of a step keep their order."""
 LEFT_OUT = {"diagnostics.alarm", "severity", "crc32", "traffic", "estimates.scv.details.gain"}
-NOTES = {"warnings", "cautions", "unmet"}
+NOTES = {"warnings", "cautions", "unmet", "failure"}
 """Of estimates.json: what features of earlier and later days wrote; its checksum, which is of words, too; and what few
 degrees of freedom leave of a variance, which rounding shows in (tests/estimators/test_scv.py has it). Notes repeat
 numbers that are compared."""
