@@ -200,7 +200,7 @@ def sensitivity(folder: Path, *, ranges: dict[str, tuple[float, float]], as_json
     say(
         *([f"{still} neither by {share(LEAST_MOVE)}."] if n_still else ()),
         "Under 'rate' and 'ratio' (to the competent driver) the left value is by how much they are multiplied with the "
-        "number at its lower end, the right one at its upper end; '–': these tests do not tell it.",
+        "number at its lower end, the right one at its upper end; '–': only tests in that traffic would tell.",
         "This assumes that the same share of each shell's events end in a crash; 'error' is by how much that is wrong "
         "for a reference driver.",
         f"report  {page}",

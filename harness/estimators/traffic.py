@@ -130,8 +130,8 @@ class Bar:
 
     @property
     def span(self) -> float:
-        """How far the rate moves, on a logarithmic scale; below 0 where the tests do not say it."""
-        return max((abs(math.log(end)) for end in self.rate if end > 0.0), default=-1.0)
+        """How far rate or ratio moves, on a logarithmic scale; below 0 where the tests do not say it."""
+        return max((abs(math.log(end)) for end in (*self.rate, *self.ratio) if end > 0.0), default=-1.0)
 
 
 def tests_of_sum(content: Mapping[str, Any]) -> str:

@@ -182,14 +182,15 @@ def sensitivity_plot(found: Sensitivity) -> Plot:
             left, at = np.maximum(rate[0][kind], low), rows[kind]
             panel.add("boxes", colour, left, rate[1][kind], at - 0.3, at + 0.3, opacity=0.85, label=f"rate, {name}")
     thin = rows - 0.06, rows + 0.06
-    most = int(np.abs(np.log(np.maximum(ratio, low))).max(axis=0).argmax())  # what moves one need not move the other
+    # What moves one need not move the other.
+    first, most = (int(np.abs(np.log(np.maximum(of, low))).max(axis=0).argmax()) for of in (rate, ratio))
     panel.add("boxes", "ink", np.maximum(ratio[0], low), ratio[1], *thin, label=f"its ratio to {found.driver}")
     panel.add("line", "muted", [1.0, 1.0], [y.low, y.high], dash=DASHED, width=1.0)
     text = (
         "Fitted and counted numbers move over nine tenths of what their data leave open, assumed ones over the stated "
         "range. "
-        f"The rate depends most on {names[0]}: × {number(rate[0][0], 2)} to × {number(rate[1][0], 2)}; its ratio to "
-        f"{found.driver} on {names[most]}: × {number(ratio[0][most], 3)} to × {number(ratio[1][most], 3)}."
+        f"The rate depends most on {names[first]}: × {number(rate[0][first], 2)} to × {number(rate[1][first], 2)}; its "
+        f"ratio to {found.driver} on {names[most]}: × {number(ratio[0][most], 3)} to × {number(ratio[1][most], 3)}."
     )
     return Plot("sensitivity", [panel], text, text)
 
