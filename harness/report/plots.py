@@ -120,7 +120,7 @@ def _rhw_panel(tests: PlotAxis, n: FloatArray, rhw: FloatArray, target: float | 
 def shells_plot(found: ShownShells) -> Plot:
     """Draw contribution with its limits (left) and half-width (right), from careful to careless."""
     shells, names = found.shells, (*(shell.shell for shell in found.shells), POOL)
-    pool = np.nan_to_num(found.pool_half_width)  # NaN where it is not known: there is no interval then
+    pool = float(np.nan_to_num(found.pool_half_width))  # NaN where it is not known: there is no interval then
     half_widths = np.array([*(shell.half_width for shell in shells), pool])
     # An untested shell may hold anything up to its probability: it would flatten all others, and runs out instead.
     tested = [shell for shell in shells if shell.n_episodes] or list(shells)

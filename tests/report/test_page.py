@@ -206,6 +206,8 @@ def test_the_plot_shows_contributions_and_half_widths(runs):
     half_widths = [*(s.half_width for s in found.shells), found.pool_half_width]
     assert marks(widths, "boxes")[""][1].tolist() == half_widths
     assert sum(map(found.share_of_uncertainty, half_widths)) == pytest.approx(1.0)
+    of_a_rough_pool = shells_plot(replace(found, rhw_from_pool=100.0)).panels[1]
+    assert marks(of_a_rough_pool, "boxes")[""][1].max() == pytest.approx(100.0 * found.rate)
 
 
 def test_counts_and_weights_by_outcome(folders, runs):
