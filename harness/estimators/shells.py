@@ -274,8 +274,9 @@ class SeenShells:
 
     def events_for(self, times: float) -> float:
         """How many times the events that the pool keeps so many times the tests would need; at least 1."""
-        kept = np.array(self.design.available or [math.inf])
-        return max(float(np.max(self.tally.tests[kept > 0] * times / kept[kept > 0], initial=1.0)), 1.0)
+        kept = np.resize(self.design.available or math.inf, self.tally.tests.size)
+        some = (kept > 0) & (self.tally.tests > 0)  # infinitely often none is none
+        return max(float(np.max(self.tally.tests[some] * times / kept[some], initial=1.0)), 1.0)
 
     def _limits(self, end: int, level: Level, begin: int = 0) -> RateLimits:
         """Of strata ``begin … end - 1``; anything is possible where crashes lie on too few paths."""

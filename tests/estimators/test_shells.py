@@ -151,6 +151,10 @@ def test_shares_of_the_crashes_have_the_limits_of_a_binomial_share():
     others = share_of_crashes(every.design, every.tally, some.tally, LEVEL, of_the_others=True)
     assert others == pytest.approx((1.0 - high, 1.0 - low), rel=1e-6)
     assert share_of_crashes(every.design, every.tally, every.tally, LEVEL, of_the_others=False)[1] == 1.0
+    untested = replace(
+        one, strata=("a", "b"), cell_stratum=(0, 1), cell_p=P[:2], cell_references=(0, 0), available=(9, 9)
+    )
+    assert SeenShells.of(untested, tally(P[:2], (4, 0), (9, 0))).events_for(math.inf) == math.inf
     uncertain = SeenShells.of(replace(one, n_paths=30), tally(P[:1], (40,), (500,)))
     fewer = SeenShells.of(one, tally(P[:1], (10,), (500,)))
     assert share_of_crashes(uncertain.design, uncertain.tally, fewer.tally, LEVEL, of_the_others=False)[0] < low
