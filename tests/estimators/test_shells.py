@@ -140,6 +140,12 @@ def test_failed_tests_outside_are_not_taken_for_safe_ones():
     assert conditional["upper_bound_outside"] >= without_pool
 
 
+def test_infinitely_many_tests_are_asked_for_of_strata_that_have_some():
+    two = replace(SHELLS, strata=("a", "b"), cell_stratum=(0, 1), cell_references=(0, 0), cell_p=P[:2], n_inside=1)
+    seen = SeenShells.of(replace(two, available=(9, 9)), tally(P[:2], (4, 0), (9, 0)))
+    assert (seen.events_for(2.0), seen.events_for(math.inf)) == (2.0, math.inf)
+
+
 def test_shares_of_the_crashes_have_the_limits_of_a_binomial_share():
     """In one stratum, of a pool without error: Σ n KL(seen, limit) is a level's threshold."""
     one = replace(SHELLS, strata=("a",), cell_stratum=(0,), cell_references=(0,), cell_p=P[:1], n_inside=1)
@@ -151,10 +157,6 @@ def test_shares_of_the_crashes_have_the_limits_of_a_binomial_share():
     others = share_of_crashes(every.design, every.tally, some.tally, LEVEL, of_the_others=True)
     assert others == pytest.approx((1.0 - high, 1.0 - low), rel=1e-6)
     assert share_of_crashes(every.design, every.tally, every.tally, LEVEL, of_the_others=False)[1] == 1.0
-    untested = replace(
-        one, strata=("a", "b"), cell_stratum=(0, 1), cell_p=P[:2], cell_references=(0, 0), available=(9, 9)
-    )
-    assert SeenShells.of(untested, tally(P[:2], (4, 0), (9, 0))).events_for(math.inf) == math.inf
     uncertain = SeenShells.of(replace(one, n_paths=30), tally(P[:1], (40,), (500,)))
     fewer = SeenShells.of(one, tally(P[:1], (10,), (500,)))
     assert share_of_crashes(uncertain.design, uncertain.tally, fewer.tally, LEVEL, of_the_others=False)[0] < low
