@@ -282,14 +282,17 @@ def pairs_plot(who: IntArray, weight: FloatArray, values: FloatArray, family: Fa
     ``values`` (2, n) are those of the axes of the family's first map.
     """
     (first, second), words = family.maps[0], family.words
-    if not who.size:
+    known = np.isfinite(values).all(axis=0)  # one that crashes before the event has met none
+    if not known.any():
         return None
-    cells = np.stack((who, values[0] // first.cell, values[1] // second.cell))
+    weight, values = weight[known], values[:, known]
+    cells = np.stack((who[known], values[0] // first.cell, values[1] // second.cell))
     (kind, *_), place = np.unique(cells, axis=1, return_inverse=True)
     place = place.ravel()  # numpy 2.0 gives it another axis
     adds = np.bincount(place, weight)
     gap, closing = (np.bincount(place, weight * x) / adds for x in values)
-    axes = PlotAxis(first.axis, 0.0, 1.1 * gap.max()), PlotAxis(second.axis, 0.0, 1.1 * closing.max())
+    ends = (max(1.1 * float(of.max()), axis.cell) for of, axis in ((gap, first), (closing, second)))
+    axes = [PlotAxis(axis.axis, 0.0, end) for axis, end in zip((first, second), ends, strict=True)]
     panel = PlotPanel(f"{words.events.capitalize()} that crash, by who crashes", *axes, height=300.0)
     told = []
     for code, (name, colour) in enumerate(WHO.items()):

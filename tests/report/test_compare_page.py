@@ -69,6 +69,11 @@ def test_the_map_holds_each_pair_with_a_crash(compared, page):
     impact = np.nanmax(np.where(pairs.who == [[2], [1]], np.nan, pairs.impact_mps), axis=0)
     harder = [replace(run, campaign=run.campaign.replaced(("crash", "counts_above_mps"), 5.0)) for run in runs]
     assert 0 < crashing_pairs(harder, found["shells"]).who.size == (impact > 5.0).sum() < impact.size
+    early = np.where(np.arange(pairs.who.size) == 0, np.nan, pairs.values)  # it crashed before the event
+    family = runs[0].family
+    assert pairs._replace(values=early).plot(family).caption.startswith(pairs.plot(family).caption.partition(". A")[0])
+    assert pairs._replace(values=0.0 * pairs.values).plot(family).markup
+    assert pairs._replace(values=np.nan * pairs.values).plot(family) is None
     for who, n in counts.items():
         assert f"{who} on {n}" in page.words
         assert f">{who} ({n})</text>" in page.html
