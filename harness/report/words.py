@@ -233,6 +233,7 @@ def _scope(campaign: Campaign, manifest: Mapping[str, Any], told: Estimates) -> 
         if not best.n_crashes or best.cautions:
             reached = ", precision not known" if best.n_crashes else ", no crash seen"
         more = go_on(best.n_episodes) if stopped_by == "episodes" else remedy_words(manifest.get("remedy"))
+        more = "" if manifest.get("expected") and best.n_crashes else more  # `width_row` has it
         ended += f"{reached} (asked: ± {share(target)}){more}"
     elif stopped_by == "episodes":
         ended = "all tests done" if campaign.accept is None else ended + go_on(best.n_episodes)

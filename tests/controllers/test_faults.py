@@ -180,7 +180,8 @@ def test_too_many_failures_are_no_answer(episodes, n, share, tmp_path, capsys):
 def test_to_go_on_is_offered_where_few_tests_failed(n, offered):
     with pytest.raises(TooManyFailedError) as caught:
         require_few_failed(Counter({"step: raises": 5}), n, Campaign(name="x"))
-    assert ("--set run.max_failed_share=" in caught.value.mend) == offered
+    assert ("--set run.max_failed_share=0.1" in caught.value.mend) == offered
+    assert f"av-check --tests {60 if offered else 48}`" in caught.value.mend
     assert "needs a new --out" in caught.value.mend
     with pytest.raises(TooManyFailedError) as caught:
         require_few_failed(Counter({"step: returned nan, expected a finite acceleration": 5}), n, Campaign(name="x"))

@@ -132,6 +132,14 @@ def test_a_rate_that_counts_no_crash_where_nothing_was_tested_says_so(name, unte
     assert (rows["unavoidable"]["what"] == "unavoidable so far") == untested
 
 
+def test_what_a_missed_precision_takes_is_told_once(stored_run):
+    run = read_run_folder(stored_run("shells-acting-twin"))
+    manifest = {**run.manifest, "expected": {"runs": run.campaign.pool.shadow_paths, "tests": 900}}
+    answer = said(run, campaign=run.campaign.replaced(("stop", "rhw"), 0.01), manifest=manifest)
+    told = " ".join([*(row.remark for row in answer.rows), answer.scope])
+    assert re.findall(r"stop\.episodes=\d+", told) == ["stop.episodes=900"]
+
+
 @pytest.mark.parametrize(("verdict", "untested"), [("rejected", False), ("rejected", True), ("accepted", True)])
 def test_an_end_that_says_nothing_is_not_shown(stored_run, verdict, untested):
     """Where a limit is rejected, or the upper end is what has not been tested: the lower end alone says something."""
