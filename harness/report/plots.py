@@ -291,9 +291,9 @@ def pairs_plot(who: IntArray, weight: FloatArray, values: FloatArray, family: Fa
     place = place.ravel()  # numpy 2.0 gives it another axis
     adds = np.bincount(place, weight)
     gap, closing = (np.bincount(place, weight * x) / adds for x in values)
-    ends = (max(1.1 * float(of.max()), axis.cell) for of, axis in ((gap, first), (closing, second)))
-    axes = [PlotAxis(axis.axis, 0.0, end) for axis, end in zip((first, second), ends, strict=True)]
-    panel = PlotPanel(f"{words.events.capitalize()} that crash, by who crashes", *axes, height=300.0)
+    ends = ((axis, max(1.1 * float(of.max()), axis.cell)) for of, axis in ((gap, first), (closing, second)))
+    across, up = (PlotAxis(axis.axis, 0.0, end) for axis, end in ends)
+    panel = PlotPanel(f"{words.events.capitalize()} that crash, by who crashes", across, up, height=300.0)
     told = []
     for code, (name, colour) in enumerate(WHO.items()):
         of, n = kind == code, count(int(np.count_nonzero(who == code)))
