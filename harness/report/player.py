@@ -182,7 +182,7 @@ def beside_other(scene: Scene, label: str, other: str, trace: pa.Table | None) -
             bv[key] = np.append(bv[key], goes_on[key][crash + 1 : shown])
             ghost[key] = ghost[key][first:shown]
         ghosts.append(ghost | {"name": other, "crash": None, "brakes": _brakes(ghost["v"], first)})
-        told[other] = _ending(ghosts[0], scene)
+        told[other] = "does not crash" if scene["event"] is None else _ending(ghosts[0], scene)
     facts = [(name.replace("AV", label), phrase) for name, phrase in scene["facts"]]
     moments = [(step, name.replace("AV", label)) for step, name in scene["moments"]]
     av["label"] = label

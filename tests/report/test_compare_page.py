@@ -16,6 +16,8 @@ from harness.report.plots import WHO
 from harness.report.several import deciding_words, pair_lines
 from harness.report.summary import read_run_folder
 from harness.runner.stored import write_report
+from tests.families.test_same_bits import SMALL
+from tests.in_process import controllers_here, one_process
 from tests.report.page_text import Page
 from tests.report.test_player import motion, scenes_in
 from tests.stored_runs import answer_in, copy_of, stored_table
@@ -110,3 +112,19 @@ def test_runs_of_another_comparison_are_refused(compared, tmp_path):
     copy_of(folder / "a", folder / "b")
     with pytest.raises(RunFolderError, match="a run of campaign"):
         write_report(folder)
+
+
+class Tailgates:
+    """Speeds up to whom it follows, and crashes before the event."""
+
+    def step(self, seen):
+        return 1.5 if seen.gap_m > 3.0 else -0.5
+
+
+def test_who_crashes_before_the_event_is_compared_and_shown(tmp_path):
+    small = ("scenario=cut_out", "world.engine=twin", "stop.episodes=200", "stop.below_reference=null", *SMALL)
+    a, b = (harness.load_campaign(av, small) for av in (f"{__name__}:Tailgates", "late-600ms"))
+    with one_process(), controllers_here():
+        found = harness.compare(a, b, tmp_path / "pair", workers=1)
+    assert found.content["n_only_a"] > 10
+    assert '"does not crash"' in found.report.read_text()
