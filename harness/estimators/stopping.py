@@ -22,7 +22,7 @@ from typing import Any, Literal
 
 from harness.campaign.campaign import Campaign
 from harness.campaign.sections import Accept, Stop
-from harness.estimators.estimate import Estimate, Note, note
+from harness.estimators.estimate import Estimate, Note, finite_json, note
 from harness.estimators.likelihood import Level
 from harness.estimators.pairs import PairDecision, Pairs, PairVerdict
 from harness.estimators.per_hour import PerHour
@@ -95,8 +95,8 @@ class Decision:
         return "accepted" if self.high < self.limit and not doubted else "undecided"
 
     def to_json(self) -> dict[str, Any]:
-        """All of it."""
-        return {"verdict": self.verdict, **asdict(self)}
+        """All of it; no upper end is null."""
+        return finite_json({"verdict": self.verdict, **asdict(self)})
 
 
 @dataclass(frozen=True)

@@ -133,17 +133,18 @@ def limit_words(decision: Mapping[str, Any]) -> str:
 
 def held_back(decision: Mapping[str, Any]) -> bool:
     """Whether only what a warning tells of keeps a vehicle from being accepted."""
-    return bool(decision["verdict"] == "undecided" and decision["high"] < decision["limit"])
+    return bool(decision["verdict"] == "undecided" and end(decision["high"]) < decision["limit"])
 
 
 def decided(decision: Mapping[str, Any]) -> Row:
     """The verdict on a limit, of one scenario or of several."""
     limit, verdict = limit_words(decision), decision["verdict"]
-    low, high = (number(decision[end]) for end in ("low", "high"))
+    low, high = number(decision["low"]), number(end(decision["high"]))
+    open_above = f"at least {low}" if decision["low"] else "nothing is known yet"
     value, ends = {
         "accepted": (f"rate below {limit}", f"at most {high}"),
         "rejected": (f"rate above {limit}", f"at least {low}"),
-    }.get(verdict, (f"limit {limit}", f"it may be {low} to {high}"))
+    }.get(verdict, (f"limit {limit}", open_above if decision["high"] is None else f"it may be {low} to {high}"))
     if held_back(decision):
         value, ends = f"rate below {limit}", "yet not accepted, see !"
     given = "" if decision["statement"] == ASSUMPTION_FREE else f", given {decision['statement']}"

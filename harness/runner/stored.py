@@ -178,7 +178,7 @@ def replay_episode(folder: str | Path, episode: Episode, *, stored: bool = False
     >>> import harness
     >>> harness.replay("runs/idm", 17)
     test 17: timeout
-      BV enters the lane 3.1 s: 26.2 m ahead and 10.1 m/s slower
+      BV enters the lane 3.1 to 3.2 s: 26.2 m ahead and 10.1 m/s slower
       AV brakes          3.2 s, 0.1 s after BV entered the lane: at up to 4.0 m/s²
       AV                 avoids it, 12.1 m at the closest
       r157-cc            a careful and competent driver: avoids it, 9.1 m at the closest

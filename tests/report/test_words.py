@@ -1,13 +1,16 @@
 """The answer at a glance of every kind of run: short, and with what changes its meaning."""
 
+import math
 import re
 from dataclasses import replace
 
 import pytest
 
 from harness.estimators.answer import AssumedOfRate, estimate_blocks
+from harness.estimators.stopping import Decision
 from harness.numbers import number, plain
 from harness.records.folder import read_manifest
+from harness.report.rows import decided, held_back
 from harness.report.summary import read_run_folder
 from harness.report.words import LINES, WIDTH, columns, lines, short_answer
 from harness.runner.stored import stored_blocks
@@ -185,3 +188,10 @@ def test_a_row_that_is_too_long_keeps_the_columns_before_what_is_long():
     shown = list(columns(rows))
     assert max(map(len, shown)) <= WIDTH
     assert [line.index(row[1]) for line, row in zip(shown, rows, strict=True)] == [15, 15, 15]
+
+
+@pytest.mark.parametrize(("low", "told"), [(0.0, "nothing is known yet"), (0.2, "at least 0.200")])
+def test_a_decision_without_an_upper_end_is_written_and_told(low, told):
+    found = Decision(0.5, "assumption_free", 0.95, low, math.inf, 40, "r157-cc").to_json()
+    assert (found["verdict"], found["high"], held_back(found)) == ("undecided", None, False)
+    assert decided(found).remark == told
