@@ -231,7 +231,8 @@ def report(folder: Path) -> None:
 @click.command(
     short_help="Simulate one test of a run again, bit for bit; watch or write it.",
     epilog=examples(
-        "harness replay runs/smoke 17",
+        "harness replay runs/smoke                         # the hardest crash",
+        "harness replay runs/smoke 17                      # test 17, crash or not",
         "harness replay runs/smoke 17 --out test_17.html   # or .csv, .xosc, .xml",
         "harness replay runs/smoke 17 --stored --out test_17.csv",
         "harness replay runs/smoke 17 --gui                # halts at the onset",
@@ -239,7 +240,7 @@ def report(folder: Path) -> None:
     ),
 )
 @click.argument("folder", metavar="DIR", type=RUN_FOLDER)
-@click.argument("episode", metavar="TEST", type=click.IntRange(min=0))
+@click.argument("episode", metavar="[TEST]", type=click.IntRange(min=0), required=False)
 @click.option(
     "--out", "files", metavar="FILE", type=FILE, multiple=True,
     help="Write the motion. The suffix says how: .html, a page that plays it; .csv, a row for each vehicle and step "
@@ -259,7 +260,7 @@ def report(folder: Path) -> None:
 @json_option
 def replay(
     folder: Path,
-    episode: int,
+    episode: int | None,
     *,
     files: Sequence[Path],
     gui: bool,
@@ -268,7 +269,7 @@ def replay(
     trust: bool,
     as_json: bool,
 ) -> None:
-    """Simulate test number TEST of the run in DIR again, bit for bit, and say what happens when.
+    """Simulate test number TEST of the run in DIR again, or the hardest crash, bit for bit, and say what happens when.
 
     It also says how two others would have fared in the vehicle's place: the careful and competent driver of UN
     Regulation No. 157 (r157-cc), and one that brakes as soon as it sees the event, at up to 8 m/s2 (brakes-8).
@@ -295,6 +296,7 @@ def replay(
     program = gui_program() if gui else None
     result = harness.replay(folder, episode, stored=stored, trust=trust)
     written = [each for file in files for each in harness.write_motion(result, file)]
+    episode = int(result.row["episode"])
     content = {"episode": episode, "outcome": result.outcome, "bit_equal": result.bit_equal}
     content |= {"files": [str(file) for file in written]}
     content |= {name: result.row[name] for name in LATERAL if name in result.row}

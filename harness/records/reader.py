@@ -221,6 +221,18 @@ def _columns(family: Family, *, sees: bool) -> tuple[list[str], list[str]]:
     return [*COLUMNS, *numbers, *in_time, "outcome"], [*path_columns(family), *in_time[:1], "outcome"]
 
 
+def hardest_crash(folder: Path, manifest: Mapping[str, Any]) -> int:
+    """Number of the run's crash at the largest impact speed, the first of equals; a `RunFolderError` without any."""
+    columns = ["episode", "impact_speed_mps"]  # null but of crashes
+    tables = [read_kept(folder, part, "episodes", columns).drop_null() for part in manifest["parts"]]
+    crashes = pa.concat_tables(tables).sort_by([("impact_speed_mps", "descending"), ("episode", "ascending")])
+    if not crashes.num_rows:
+        raise RunFolderError(
+            str(folder), "no crash", "the number of a test to replay", "Name one: harness replay DIR 0."
+        )
+    return int(crashes["episode"][0].as_py())
+
+
 def by_kind(causes: Mapping[str, int]) -> Counter[str]:
     """How often each kind of failure was: of causes that differ in digits alone the most frequent stands for all."""
     shown, kinds = dict[str, str](), Counter[str]()

@@ -27,6 +27,7 @@ from harness.estimators.shells import SeenShells
 from harness.families import family_named
 from harness.families.protocol import Environment
 from harness.processes import made_ahead
+from harness.records import reader
 from harness.records.folder import CAMPAIGN, ESTIMATES, Part, no_episodes, read_as, read_kept, read_manifest
 from harness.records.reader import N_READERS, code_of, read_campaign, require_campaign, require_trust, traffic_of
 from harness.records.schemas import moments_schema, shard_tables
@@ -60,8 +61,8 @@ class StoredEstimates(ShownInPython, dict[str, Any]):
 
         if self._by_estimator or "families" in self:
             return estimate_lines(self) if self._by_estimator else hour_lines(self)
-        manifest = read_manifest(self._folder)
-        return run_lines(read_campaign(self._folder, manifest), manifest, self, self._folder / "report.html")
+        folder, manifest = self._folder, read_manifest(self._folder)
+        return run_lines(read_campaign(folder, manifest), manifest, self, folder / "report.html")
 
     def _plot(self) -> Plot | None:
         """The map of its tests, where what is told is of their own traffic."""
@@ -153,23 +154,25 @@ _UNLIKE_BITS = ("episode", "seed", "failure")
 
 
 @checked("harness.replay")
-def replay_episode(folder: str | Path, episode: Episode, *, stored: bool = False, trust: bool = False) -> ReplayResult:
+def replay_episode(
+    folder: str | Path, episode: Episode | None = None, *, stored: bool = False, trust: bool = False
+) -> ReplayResult:
     """Replay an episode of a run; a user's own code in a process of its own.
 
     Parameters
     ----------
     folder : str or Path
         Run folder.
-    episode : int
-        Index of the test in the campaign, from 0.
+    episode : int, optional
+        Index of the test in the campaign, from 0; by default that of the hardest crash.
     stored : bool
         Whether to give it as the run has traced it: nothing is simulated.
     trust : bool
         Whether to run code that the folder names though it was not made on this machine by this user.
 
-    Raises `RunFolderError`: the folder is no run, has no such episode, or none that is traced, the campaign or the
-    environment's parameter file has changed since, or it names code that is not trusted. Raises `CampaignError`: the AV
-    is not reproducible. Raises `HarnessError`: SUMO's system libraries are missing.
+    Raises `RunFolderError`: the folder is no run, has no crash or no such episode, or none that is traced, the campaign
+    or the environment's parameters have changed since, or it names code that is not trusted. Raises `CampaignError`: the
+    AV is not reproducible. Raises `HarnessError`: SUMO's system libraries are missing.
 
     Examples
     --------
@@ -186,6 +189,7 @@ def replay_episode(folder: str | Path, episode: Episode, *, stored: bool = False
     """
     folder = Path(folder)
     manifest = read_manifest(folder)
+    episode = reader.hardest_crash(folder, manifest) if episode is None else episode
     tables = _stored(folder, manifest, episode)
     campaign = read_campaign(folder, manifest, check_files=not stored)
     if not stored:
@@ -265,8 +269,7 @@ def _require_reproducible(manifest: dict[str, Any], campaign: Campaign) -> None:
     if repeated := manifest.get("repeated"):
         differing, n = len(repeated["differing"]), repeated["n_episodes"]
         found = f"a run that is not reproducible: {differing} of the {n} tests that it ran twice differed"
-        mend = "Draw only from the generator handed over in start, ask no clock, and keep nothing from one test to the "
-        mend += "next (`harness av-check` finds the cause). The kept traces (--stored) are what happened."
+        mend = "`harness av-check` finds the cause. The kept traces (--stored) are what happened."
         raise CampaignError("av", found, "an AV that does the same again on the same observations and stream", mend)
     found = "a run that is not reproducible: a program outside of the harness drove the AV"
     mend = "Look at the traces that the run has kept (--stored; records.traces: crash), or let the program write a log."
@@ -281,8 +284,8 @@ def _stored(folder: Path, manifest: dict[str, Any], episode: int) -> dict[str, p
             return {name: table.filter(pc.equal(table["episode"], episode)) for name, table in tables.items()}
     if not manifest["n_episodes"]:
         raise no_episodes(folder)
-    mend = "The report lists the tests of interest, the table `episodes` all."
-    raise RunFolderError(str(folder), f"no test {episode}", f"a number from 0 to {manifest['n_episodes'] - 1}", mend)
+    expected, mend = f"a number from 0 to {manifest['n_episodes'] - 1}", "The report lists the tests of interest."
+    raise RunFolderError(str(folder), f"no test {episode}", expected, mend)
 
 
 def _equal(again: pa.Table, stored: pa.Table) -> bool:
@@ -351,8 +354,7 @@ def estimate_families(
         told[name] = read_as(Estimates, of / ESTIMATES, mend=MEND), manifest
     answer = hour_answer(PerHour(families), ready, told, confidence or stored["confidence"], counts=counts)
     decision = stored["decision"] if given == stored["exposure"] else None  # which the run took at its own
-    content = finite_json({**stored, "exposure": given, "decision": decision, **answer})
-    return StoredEstimates(content, folder)
+    return StoredEstimates(finite_json({**stored, "exposure": given, "decision": decision, **answer}), folder)
 
 
 @checked("harness.write_report")
@@ -365,9 +367,7 @@ def write_report(folder: str | Path) -> Path:
         Run folder, or the folder of a comparison, or of several scenarios.
 
     The page is self-contained: it can be mailed, archived and opened offline. The same folder gives the same bytes if
-    it is reached from the working directory by the same relative path, by which the commands on the page name it;
-    outside the working directory they use its name alone. Plots of an earlier report that this one does not have are
-    removed.
+    it is reached by the same relative path, by which the commands on the page name it.
 
     Raises `RunFolderError`: if the folder misses a file, or a file is damaged or belongs to another run.
     """

@@ -28,8 +28,8 @@ from harness.runner.stored import write_report
 from harness.vehicles.kinematics import VEHICLE_LENGTH_M
 from harness.vocabulary import VEHICLES
 from harness.worlds.sumo import sumo_program
-from tests.in_process import controllers_here
-from tests.stored_runs import copy_of, part_files, stored_table, truncate
+from tests.in_process import controllers_here, run_here
+from tests.stored_runs import copy_of, golden, part_files, stored_table, truncate
 
 KINDS = ("shells-twin", "shells-lateral-sumo", "forced-lateral-twin", "shells-acting-twin", "forced-krauss", "nde-twin")
 
@@ -125,6 +125,18 @@ def test_replay_says_what_happens_and_writes_the_page(stored_run, tmp_path, caps
     assert f"{row['event_gap_m']:.1f} m ahead and {-row['event_rate_mps']:.1f} m/s slower" in told["BV enters the lane"]
     assert f"{row['onset_gap_m']:.1f} m ahead" in told["BV comes over"]
     assert scenes_in(file.read_text(encoding="utf-8"))[0]["episode"] == episode
+
+
+def test_without_a_number_the_hardest_crash_is_replayed(stored_run, tmp_path, capsys):
+    folder = stored_run("forced-lateral-sumo")
+    rows = stored_table(folder, "episodes").select(["episode", "impact_speed_mps"]).drop_null().to_pylist()
+    hardest = max(rows, key=lambda row: (row["impact_speed_mps"], -row["episode"]))
+    assert main(["replay", str(folder)]) == 0
+    assert capsys.readouterr().out.startswith(f"test {hardest['episode']}: crash; bit for bit as stored\n")
+    run_here(golden("nde-twin", "stop.episodes=5"), tmp_path / "run")
+    with pytest.raises(harness.HarnessError, match="no crash") as refused:
+        harness.replay(tmp_path / "run")
+    assert refused.value.mend == "Name one: harness replay DIR 0."
 
 
 @pytest.mark.parametrize(
