@@ -291,6 +291,8 @@ def _ending(track: Scene, scene: Scene) -> str:
     first, cut, crash = scene["first"], scene["event"], track["crash"]
     if crash is None:
         places = range(cut + 1 - first, min(len(track["x"]), len(bv["x"])))
+        if not places:  # it has ended before the event, by an impact too soft to count
+            return "does not crash"
         closest, end = min(_gap(track, bv, place) for place in places), places[-1]
         gap = f"{tenths(closest)} m" if closest >= 0.05 else "< 0.1 m"
         if (rate := _closing(track, bv, end)) > 0.0 and _gap(track, bv, end) < rate * UNDECIDED_S:

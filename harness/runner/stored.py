@@ -171,8 +171,8 @@ def replay_episode(
         Whether to run code that the folder names though it was not made on this machine by this user.
 
     Raises `RunFolderError`: the folder is no run, has no crash or no such episode, or none that is traced, the campaign
-    or the environment's parameters have changed since, or it names code that is not trusted. Raises `CampaignError`: the
-    AV is not reproducible. Raises `HarnessError`: SUMO's system libraries are missing.
+    or the environment's parameters have changed since, or it names code that is not trusted; `CampaignError`: the AV is
+    not reproducible; `HarnessError`: SUMO's system libraries are missing.
 
     Examples
     --------

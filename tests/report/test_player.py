@@ -154,6 +154,8 @@ def test_a_test_that_ends_while_the_vehicle_closes_in_has_avoided_nothing(speed,
     av = {"x": speed * time_s, "v": np.full(6, speed), "crash": None}
     scene = {"scenario": "cut_in", "principal": "BV", "tracks": [{}, bv, av], "first": 0, "event": 0, "onset": onset}
     assert player._ending(av, scene) == said
+    ends_before = {"x": av["x"][:1], "v": av["v"][:1], "crash": None}  # by an impact too soft to count
+    assert player._ending(ends_before, scene) == "does not crash"
 
 
 @pytest.mark.parametrize("scenario", ["lead_brakes", "cut_out"])
