@@ -13,7 +13,7 @@ import numpy as np
 from harness.compiled import compiled, compiled_inline
 from harness.vocabulary import FloatArray
 
-INITIAL, LV_DRAWS, BV_DRAWS, BV_FREE_DRAWS, CUT_IN, AV_DRAWS, DIAGNOSTIC, LATERAL = range(8)
+INITIAL, LV_DRAWS, BV_DRAWS, BV_FREE_DRAWS, EVENT, AV_DRAWS, DIAGNOSTIC, LATERAL = range(8)
 """Streams. A stream is one purpose, so that adding a purpose never shifts the numbers of another."""
 
 _M0 = np.uint64(0xD2E7470EE14C6C93)

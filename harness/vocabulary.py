@@ -1,10 +1,9 @@
-"""The vocabulary in code: array types, the state's five numbers, outcomes, vehicles, methods of drawing, estimators."""
+"""The vocabulary in code: array types, outcomes, vehicles, methods of drawing, estimators."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Any, Literal, NamedTuple, TypeAlias, TypeVar, get_args
+from typing import Any, Literal, TypeAlias, TypeVar, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,30 +29,6 @@ def read_only(array: NDArray[_Scalar]) -> NDArray[_Scalar]:
     return array
 
 
-class State(NamedTuple):
-    """Ranges are bumper to bumper, rates the leader's minus the follower's speed; R1 is LV-BV, R2 is BV-AV.
-
-    Compiled code passes it as it stands; many of them are a structured array of `STATE_DTYPE`, whose records have the
-    same fields.
-    """
-
-    v_bv_mps: float
-    r1_m: float
-    r1dot_mps: float
-    r2_m: float
-    r2dot_mps: float
-
-
-STATE_COLUMNS = State._fields
-STATE_DTYPE = np.dtype([(name, np.float64) for name in STATE_COLUMNS])
-
-
-def states_from(columns: Iterable[FloatArray]) -> RecordArray:
-    """States (n,) from their five columns (n,) each."""
-    states: RecordArray = np.column_stack(list(columns)).view(STATE_DTYPE)[:, 0]
-    return states
-
-
 Method = Literal["nde", "forced", "step_mixture", "episode_mixture", "shells"]
 EstimatorName = Literal["nde", "nade", "mixture_cv", "dr", "scv", "shells"]
 StoppedBy = Literal["rhw", "below_reference", "accept", "episodes", "pool", "pool_error", "sum"]
@@ -77,10 +52,10 @@ class Sampling:
     mixes_steps: bool = False  # importance functions of the surrogates, in every critical step
     mixes_episodes: bool = False  # or one per episode
     forces: bool = False  # forced cut-ins are among what it draws from
-    holds_speed: bool = False  # the AV must, until the cut-in: what is drawn before the episode depends on it
-    baseline_runs: bool = False  # an AV that does not is driven along each path without a cut-in first
+    holds_speed: bool = False  # the AV must, until the event: what is drawn before the episode depends on it
+    baseline_runs: bool = False  # an AV that does not is driven along each path without an event first
     bounded: bool = True  # weights are, whatever testing.epsilon is; else no precision can be promised
-    strata: bool = False  # tests are cut-ins of the pool, counted within strata of known probability
+    strata: bool = False  # tests are events of the pool, counted within strata of known probability
     controlled: bool = True  # something is drawn otherwise than the environment would; else every test weighs 1
 
     @property
@@ -113,8 +88,3 @@ RUNNING = -1
 
 VEHICLES = ("LV", "BV", "AV")
 LV, BV, AV = range(len(VEHICLES))
-
-N_ACCELERATIONS, CUT_IN, STAY = 31, 31, 32
-"""Maneuvers of BV: accelerations 0 … 30, and then, before a cut-in, changing lanes or not."""
-ACCELERATIONS_MPS2 = (np.arange(N_ACCELERATIONS) - 20) / 5.0
-"""-4 … 2 m/s² in steps of 0.2 [ndd]; written as a quotient so that every value is the nearest double."""

@@ -21,9 +21,10 @@ from harness.estimators.estimate import finite_json
 from harness.families.cut_in.events import write_maneuvers
 from harness.families.cut_in.laws import Environment, InitialStates
 from harness.families.cut_in.loading import evaluate_laws, load_environment
+from harness.families.cut_in.vocabulary import ACCELERATIONS_MPS2
 from harness.families.protocol import Paths
 from harness.vehicles.kinematics import STEP_S
-from harness.vocabulary import ACCELERATIONS_MPS2, BV, LV, FloatArray
+from harness.vocabulary import BV, LV, FloatArray
 
 PUBLISHED = Path(__file__).with_name("published.yaml")
 N_PATHS, SEED = 4096, 1

@@ -26,10 +26,11 @@ from harness.compiled import compiled_threads, unboxed
 from harness.families.cut_in import laws
 from harness.families.cut_in.lateral import draw_lead
 from harness.families.cut_in.laws import AccelerationLaw, Environment, InitialStates
+from harness.families.cut_in.vocabulary import State
 from harness.files import write_atomically
-from harness.random_stream import BV_DRAWS, CUT_IN, LV_DRAWS, uniform
+from harness.random_stream import BV_DRAWS, EVENT, LV_DRAWS, uniform
 from harness.vehicles.kinematics import STEP_S, next_position, next_speed
-from harness.vocabulary import FloatArray, IntArray, RecordArray, State
+from harness.vocabulary import FloatArray, IntArray, RecordArray
 
 TRIPLE_S, PAUSE_S = 20, 5
 RECORDING_H = 0.5
@@ -116,7 +117,7 @@ def drive(
         v[i, AV, 0] = max(start[i].v_bv_mps - start[i].r2dot_mps, 0.0)
         x[i, LV, 0] = start[i].r1_m + 0.5 * (length[i, LV] + length[i, BV])
         x[i, AV, 0] = -start[i].r2_m - 0.5 * (length[i, AV] + length[i, BV])
-        clock = -math.log(1.0 - uniform(seed, i, CUT_IN, 0))
+        clock = -math.log(1.0 - uniform(seed, i, EVENT, 0))
         cut[i], lead[i], upto[i, AV] = -1, 0, -1
         t = 0
         while True:

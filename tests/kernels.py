@@ -18,8 +18,8 @@ from harness.families.cut_in.nade import functions, likelihood_ratio
 from harness.families.cut_in.nade.challenge import remaining_level
 from harness.families.cut_in.nade.decide import draw_from
 from harness.families.cut_in.nade.grid import AFTER, interpolate, locate
+from harness.families.cut_in.vocabulary import State
 from harness.vehicles import drivers, kinematics, references
-from harness.vocabulary import State
 
 # -- traffic --
 

@@ -119,7 +119,7 @@ class Campaign(Section):
 
     @property
     def has_baseline_runs(self) -> bool:
-        """Whether the AV is first driven along its paths without a cut-in."""
+        """Whether the AV is first driven along its paths without an event."""
         return self.av.acts_before_event and self.sampling.baseline_runs
 
     @property
@@ -174,7 +174,7 @@ class Campaign(Section):
         return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:16]
 
 
-# -- what does not go with what: one table of methods, vehicles, cut-ins, engines and commands --
+# -- what does not go with what: one table of methods, vehicles, events, engines and commands --
 
 Command = Literal["run", "compare", "av-check"]
 
@@ -245,20 +245,20 @@ REFUSED = (
         "a file of a scenario that is not among scenarios, or of cut_in", "files of the others that are tested",
         "Name it among scenarios; that of cut_in, or of one scenario alone, is environment.parameters.",
     ),
-    # -- vehicles that act before the cut-in --
+    # -- vehicles that act before the event --
     Combination(
         "av.before_event",
         lambda c, use: (
             c.av.acts_before_event and (c.sampling.holds_speed or (use.shows and not c.sampling.baseline_runs))
         ),
         "controller, with testing.method {testing.method}",
-        "hold_speed: the method draws the cut-in, or its onset, ahead, which needs to know the AV's path",
+        "hold_speed: the method draws the event, or its onset, ahead, which needs to know the AV's path",
         "Choose hold_speed, or testing.method shells (or forced), which drives the AV along its paths first.",
     ),
     Combination(
         "av.before_event", lambda c, _: c.av.acts_before_event and c.av.model is not None,
         "controller, with the built-in model {av.model}",
-        "hold_speed: a built-in model has nothing to follow before the cut-in",
+        "hold_speed: a built-in model has nothing to follow before the event",
         "Delete the key, or bring a controller of your own.",
     ),
     # -- where tests are simulated --
@@ -338,7 +338,7 @@ REFUSED = (
     # -- comparisons --
     Combination(
         "testing.method", lambda c, use: use.command == "compare" and not c.sampling.strata,
-        "{testing.method}, in a comparison", "shells, under which both vehicles meet the same cut-ins",
+        "{testing.method}, in a comparison", "shells, under which both vehicles meet the same events",
         "Write --set testing.method=shells; or run both by themselves and put their intervals side by side.",
     ),
     Combination(
@@ -348,8 +348,8 @@ REFUSED = (
     ),
     Combination(
         "av.before_event", lambda c, use: use.command == "compare" and c.has_baseline_runs,
-        "controller: a vehicle that acts before the cut-in has cut-ins of its own",
-        "hold_speed in A and B: pairs need the same cut-ins",
+        "controller: a vehicle that acts before the event has events of its own",
+        "hold_speed in A and B: pairs need the same events",
         "Run both campaigns by themselves and put their intervals side by side, or write hold_speed.",
     ),
 )  # fmt: skip

@@ -150,7 +150,7 @@ class Testing(Section):
     """How maneuvers are drawn at critical moments."""
 
     method: Method = "shells"
-    """shells: cut-ins of a pool; forced: a cut-in in every test; nde: no control; step_mixture: NADE as published;
+    """shells: events of a pool; forced: an event in every test; nde: no control; step_mixture: NADE as published;
     episode_mixture: one importance function per test"""
     estimator: str | None = None
     """what answers and stops instead of the method's own: a name, or my.py:MyEstimator"""
@@ -192,7 +192,7 @@ LEAST_POOL_ERROR, MOST_EVENTS = 0.001, 1_000_000
 
 
 class PoolSettings(Section):
-    """The pool of cut-ins that shells are drawn from; built once, in the twin."""
+    """The pool of events that shells are drawn from; built once, in the twin."""
 
     library: str | None = None
     """name of a shipped surrogate library, or a path to your own; none: the traffic's"""
@@ -200,9 +200,9 @@ class PoolSettings(Section):
     """relative standard error of the surrogates' crash rates, four times that beyond the boundary; none: the
     scenario's, 0.005 or 0.01"""
     events_per_shell: Whole = Field(25_000, ge=100, le=MOST_EVENTS)
-    """cut-ins kept of each shell: its most tests"""
+    """events kept of each shell: its most tests"""
     shadow_paths: Whole = Field(500, ge=50, le=100_000)
-    """baseline runs of a vehicle that acts before the cut-in"""
+    """baseline runs of a vehicle that acts before the event"""
     seed: Whole = Field(1, ge=0, lt=2**63)
     """of the pool and of baseline runs, which another seed alone leaves as they are"""
 

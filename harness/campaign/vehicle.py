@@ -139,11 +139,11 @@ class AutomatedVehicle(Section):
     """of the built-in model or of the controller"""
     reaction: Reaction = Reaction()
     before_event: Literal["hold_speed", "controller"] = "hold_speed"
-    """hold_speed until the cut-in [itsc], or controller: it acts from the start"""
+    """hold_speed until the event [itsc], or controller: it acts from the start"""
     takes_over: Literal["first_braking", "onset"] = "first_braking"
     """it keeps its speed until it first asks to brake, or BV is on its lane; or until the onset alone"""
     warm_up_s: StepTime = Field(2.0, ge=0.0, le=60.0)
-    """time before the cut-in shown to a controller or FMU that keeps its speed; its answers are unused"""
+    """time before the event shown to a controller or FMU that keeps its speed; its answers are unused"""
     limits: Limits = Limits()
 
     @property
@@ -158,7 +158,7 @@ class AutomatedVehicle(Section):
 
     @property
     def warm_up_steps(self) -> int:
-        """Steps before the cut-in that its controller is shown; 0 for what is not asked by the harness, or always."""
+        """Steps before the event that its controller is shown; 0 for what is not asked by the harness, or always."""
         warms_up = self.source in ("controller", "fmu") and not self.acts_before_event
         return round(10.0 * self.warm_up_s) if warms_up else 0
 
@@ -213,7 +213,7 @@ class AutomatedVehicle(Section):
             raise broken_rule("traci_style", f"traci_style {beside}", "it only beside a controller", "Leave it out.")
         if self.takes_over == "onset" and (self.source in ("sumo", "traci") or self.acts_before_event):
             beside = f"beside before_event: {self.before_event}" if self.acts_before_event else beside
-            mend = "Leave it out. SUMO hands over at the overlap; who acts before the cut-in drives from the start."
+            mend = "Leave it out. SUMO hands over at the overlap; who acts before the event drives from the start."
             raise broken_rule("takes_over", f"onset {beside}", "a vehicle that is asked from the onset on", mend)
         if self.model is None and self.reaction != Reaction():
             mend = "Your own driver has its own delays: leave av.reaction out."

@@ -49,14 +49,14 @@ def episodes_schema(
 ) -> pa.Schema:
     """Schema of the ``episodes`` table of a family, by numbers of importance functions, surrogates, cells of shells.
 
-    ``columns`` are the family's facts. Shells of vehicles that act before the cut-in have columns of their own, and so
+    ``columns`` are the family's facts. Shells of vehicles that act before the event have columns of their own, and so
     have cut-ins that take time.
     """
     of_shells = [
         _field("cell", _I2, "1", "cell of shells.json: shell, and which references crash (method shells alone)"),
-        _field("cell_mass", _per(n_cells), "1", "P of a cut-in of each cell on the same path (method shells alone)"),
+        _field("cell_mass", _per(n_cells), "1", "P of an event of each cell on the same path (method shells alone)"),
     ]
-    own = "P of the test's own cut-in, or of those it stands for, in the measure of cell_mass"
+    own = "P of the test's own event, or of those it stands for, in the measure of cell_mass"
     of_baseline_runs = [
         _or_null("shadow", _I8, "1", "baseline run that the test repeats (method shells, vehicles that act before)"),
         _or_null("event_mass", _F8, "1", own),
@@ -68,9 +68,9 @@ def episodes_schema(
             *_facts(columns),
             _field("outcome", _NAME, "", "crash, passed, timeout, bv_lv_contact or failed"),
             _field("n_steps", _I2, "0.1 s", "steps simulated until the test ended"),
-            _or_null("event_step", _I2, "0.1 s", "step in which BV cut in, null without one"),
-            _or_null("event_gap_m", _F8, "m", "R2 at the cut-in decision"),
-            _or_null("event_rate_mps", _F8, "m/s", "R2dot at the cut-in decision"),
+            _or_null("event_step", _I2, "0.1 s", "step of the event, null without one"),
+            _or_null("event_gap_m", _F8, "m", "R2 then, the gap to the vehicle it is about"),
+            _or_null("event_rate_mps", _F8, "m/s", "R2dot then, its rate of change"),
             _or_null("took_over_step", _I2, "0.1 s", "first step in which the AV did what its vehicle asked for"),
             _field("asked_to_speed_up", pa.bool_(), "", "whether it asked to speed up while it was held at its speed"),
             _field("braked_before", pa.bool_(), "", "whether it asked to brake while nothing happened, in its warm-up"),
@@ -79,7 +79,7 @@ def episodes_schema(
             ),
             _or_null("crash_time_s", _F8, "s", "time of the crash"),
             _or_null("impact_speed_mps", _F8, "m/s", "v_AV - v_BV at the crash"),
-            _or_null("min_ttc_s", _F8, "s", "smallest R2/-R2dot after the cut-in while closing"),
+            _or_null("min_ttc_s", _F8, "s", "smallest R2/-R2dot after the event while closing"),
             _or_null("end_ttc_s", _F8, "s", "of a timeout: to a collision as it accelerates (a program: at its speed)"),
             _field(
                 "hardest_braking_mps2", _F8, "m/s2", "largest deceleration of the AV after the onset, 0 without any"
@@ -88,10 +88,10 @@ def episodes_schema(
             _field("n_control_steps", _I2, "1", "stratum l: steps drawn from an importance function"),
             _field("component", _I1, "1", "importance function drawn (episode mixture), or shell, else -1"),
             _field("log_weight", _F8, "1", "log p(x_c) - log q_sampled(x_c), 0 without control; of shells log p_s"),
-            _or_null("log_p_event", _F8, "1", "log P(cut-in | path), where the method draws the path ahead"),
+            _or_null("log_p_event", _F8, "1", "log P(event | path), where the method draws the path ahead"),
             _field("log_q", _per(n_importance), "1", "per importance function: sum of log(q_j/p)"),
             _field("martingale", _per(n_surrogates), "1", "per surrogate: sum W_t C_j,t - W_(t-1) V_j,t"),
-            _or_null("pool_row", _I8, "1", "row of the pool's cut-in (method shells), else null"),
+            _or_null("pool_row", _I8, "1", "row of the pool's event (method shells), else null"),
             *(of_shells if n_cells else ()),
             *(of_baseline_runs if acts else ()),
             *(_lateral_fields() if shows else ()),

@@ -52,9 +52,9 @@ CAUSES: dict[Cause, str] = {
 
 @dataclass(frozen=True)
 class Behaviour:
-    """What the AV did in all steps in which it acted, and after the cut-ins.
+    """What the AV did in all steps in which it acted, and after the events.
 
-    ``reaction_s`` is the median time from the onset of the cut-in to the first braking beyond 0.1 m/s², over the
+    ``reaction_s`` is the median time from the onset of the event to the first braking beyond 0.1 m/s², over the
     episodes that braked at all; their share is ``braking_share``. ``n_took_over_early`` did something before the
     overlap, ``n_braked_before`` asked to brake before the onset.
     """
@@ -98,7 +98,7 @@ class Speed:
 
 @dataclass(frozen=True, repr=False)
 class AvCheck(ShownInPython):
-    """What a few dozen episodes say about an AV, run on an engine with cut-ins that a method brought about.
+    """What a few dozen episodes say about an AV, run on an engine with events that a method brought about.
 
     ``failures`` are numbers of episodes of the first run by the cause that they failed with, where one stands for all
     that differ from it in digits alone; ``differing`` are those whose motion was not the same bits in the two layouts,

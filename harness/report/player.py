@@ -30,7 +30,7 @@ from harness.vehicles.library import library_records
 from harness.vocabulary import FloatArray, IntArray
 
 UNKNOWN = -9
-"""How it ends for them where the AV acts before the cut-in and its motion is not on record."""
+"""How it ends for them where the AV acts before the event and its motion is not on record."""
 MOTION = ("x_m", "v_mps")
 LANE_M = 3.6
 BRAKES_MPS2 = 0.5

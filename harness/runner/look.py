@@ -38,7 +38,7 @@ CELLS, OTHER_CELLS = 16, 5
 """Two layouts in which every episode has other neighbours, and mostly another cell."""
 SHORTEST_TIMING_S = 0.3
 BRAKING_MPS2 = -0.1
-"""What counts as a reaction to the cut-in."""
+"""What counts as a reaction to the event."""
 AT_LIMIT_MPS2 = 1e-9
 WARM_UP_EPISODES, LONGER, LONGEST_S = 12, 10.0, 60.0
 """Tests in which the warm-up is left out, or made ten times as long."""

@@ -219,7 +219,7 @@ def _ends(of: Mapping[str, Any]) -> Ends:
 
 # -- what the answer depends on: fitted numbers move by their standard errors or, where there are replicates, in blocks,
 # as those of a block were fitted together; assumed numbers over the range that is stated for them. Crash shares within
-# shells stay as they were: of numbers that change what happens after a cut-in they tell nothing but what the reference
+# shells stay as they were: of numbers that change what happens after an event they tell nothing but what the reference
 # drivers show, by how much their rates, which are known there, would come out wrong --
 
 

@@ -31,8 +31,7 @@ from harness.loop.loop import EpisodeLoop, RecordPolicy, Shard
 from harness.loop.repeat import Traffic
 from harness.pool.vehicle_pool import BaselinePaths
 from harness.progress import Progress
-from harness.random_stream import CUT_IN as EVENT
-from harness.random_stream import uniforms
+from harness.random_stream import EVENT, uniforms
 from harness.records.folder import MILDER, SHADOW, Part, read_kept
 from harness.records.schemas import baseline_table, episodes_table, padded
 from harness.resolved import Resolved

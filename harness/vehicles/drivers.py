@@ -2,7 +2,7 @@
 
 These are IDM, FVDM, and one that does not look ahead. `references` has those that remember a danger, and how
 a driver lags behind its model: it may react late, change its acceleration slowly, or not look. It keeps its speed until
-it reacts to the cut-in; then its model decides, as fast as its jerk limit allows.
+it reacts to the event; then its model decides, as fast as its jerk limit allows.
 
 Only + − × ÷ √ and explicit products are used (and ``math.tanh``, inside compiled code alone), so that every caller gets
 the same bits.

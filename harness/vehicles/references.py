@@ -174,7 +174,7 @@ def still_cruises(cruises: bool, bv_overlaps: bool, asked: float) -> bool:
 
 @compiled_inline
 def reaction_steps(driver: Record, seed: int, episode: int) -> int:
-    """Steps that pass after the cut-in before the driver reacts, its inattention in this episode included."""
+    """Steps that pass after the event before the driver reacts, its inattention in this episode included."""
     if driver.inattention_probability > 0.0 and uniform(seed, episode, AV_DRAWS, 0) < driver.inattention_probability:
         return int(driver.delay_steps + driver.inattention_steps)
     return int(driver.delay_steps)

@@ -23,7 +23,7 @@ class World:
 
     ``x``, ``v``, ``lane`` (K, V) are front bumpers' positions (m), speeds (m/s) and lanes (0 right, 1 left), as the
     world reports them. One that ``drives_av`` itself (SUMO's own models, or a program connected to SUMO) does so from
-    the start of an episode if it ``acts_before_event``, else from the step after the cut-in.
+    the start of an episode if it ``acts_before_event``, else from the step after the event.
     """
 
     drives_av = acts_before_event = False
@@ -86,6 +86,6 @@ def build_world(campaign: Campaign, n_cells: int | None = None) -> World:
 
     if av.sumo is None:
         return SumoWorld(cells, vehicles)
-    if recyclable(av.sumo) and not early:  # one that is released at the start remembers the last episode's cut-in
+    if recyclable(av.sumo) and not early:  # one that is released at the start remembers the last episode's event
         return SumoAvWorld(cells, av.sumo, vehicles)
     return FreshWorld(av.sumo, campaign.seed, vehicles, acts_before_event=early)

@@ -2,7 +2,7 @@
 
 SUMO and the program are started, watched and ended together. Within a step SUMO serves the program first and the
 harness last. So whatever the program commands to an AV that must hold its speed, or whose cell has just been refilled,
-is overruled in the same step. From the step after the cut-in on the harness leaves the AV alone: its position and speed
+is overruled in the same step. From the step after the event on the harness leaves the AV alone: its position and speed
 are read. LV and BV are compared in every bit, in every step.
 
 SUMO 1.28 binds its server to INADDR_ANY, has no option for another address, and takes the first clients that come for
@@ -228,7 +228,7 @@ def _exit_words(code: int) -> str:
 
 
 class TraciWorld(SumoCells):
-    """World whose AVs are driven by a connected program, after the cut-in or from the start of an episode."""
+    """World whose AVs are driven by a connected program, after the event or from the start of an episode."""
 
     drives_av = True
 
@@ -367,7 +367,7 @@ class TraciWorld(SumoCells):
 
 def _meddled(where: str, found: str, expected: str) -> WorldDisagreementError:
     mend = (
-        "A TraCI client may only command AVs ('AV0', 'AV1', ...), on their lane, after the cut-in: moving LV or "
+        "A TraCI client may only command AVs ('AV0', 'AV1', ...), on their lane, after the event: moving LV or "
         "BV, or changing lanes, would make the likelihood ratios wrong. If yours does not, please report it."
     )
     return WorldDisagreementError(f"SUMO, {where}", found, expected, mend)

@@ -1,4 +1,4 @@
-"""Worlds in which SUMO's own car-following model drives the AV from the step after the cut-in, and its vehicle type.
+"""Worlds in which SUMO's own car-following model drives the AV from the step after the event, and its vehicle type.
 
 Until then the AV is commanded and compared like LV and BV. Then it is released (``setSpeed`` -1) under SUMO's default
 speed mode: its position and speed are read, not compared. LV and BV stay commanded and compared in every bit.
@@ -128,7 +128,7 @@ def _wrong(name: str, found: str | float, expected: str, mend: str) -> CampaignE
 
 
 class SumoAvWorld(SumoWorld):
-    """`SumoWorld` whose AVs (see `av_type`) are driven by SUMO after the cut-in, or from the start of an episode."""
+    """`SumoWorld` whose AVs (see `av_type`) are driven by SUMO after the event, or from the start of an episode."""
 
     drives_av, _av_type = True, "av"
 

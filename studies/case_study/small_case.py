@@ -28,9 +28,10 @@ from harness.families.cut_in.laws import Environment
 from harness.families.cut_in.loading import evaluate_laws, load_environment
 from harness.families.cut_in.nade.challenge import roll_out
 from harness.families.cut_in.nade.grid import GridPoints
+from harness.families.cut_in.vocabulary import ACCELERATIONS_MPS2, N_ACCELERATIONS
 from harness.vehicles.drivers import av_records, driver_records
 from harness.vehicles.kinematics import CONTACT_M, STEP_S
-from harness.vocabulary import ACCELERATIONS_MPS2, CRASH, N_ACCELERATIONS, TIMEOUT, BoolArray, FloatArray, RecordArray
+from harness.vocabulary import CRASH, TIMEOUT, BoolArray, FloatArray, RecordArray
 from studies.case_study.counted import Claims, KnownMeans
 from studies.case_study.figures import covered, exactly, is_settled, marked, mean_of, range_of, tests_for
 from studies.case_study.study import Context, SmallCase

@@ -185,7 +185,7 @@ class Faster(IDM):
 
 
 def test_a_method_that_draws_the_path_ahead_refuses_it():
-    with pytest.raises(CampaignError, match=r"draws the cut-in.*shells \(or forced\)"):
+    with pytest.raises(CampaignError, match=r"draws the event.*shells \(or forced\)"):
         forced(EARLY, "testing={method: episode_mixture}")
 
 

@@ -10,12 +10,13 @@ import pytest
 
 from harness.families.cut_in.events import Maneuvers
 from harness.families.cut_in.script import facts_of, script_of
+from harness.families.cut_in.vocabulary import CUT_IN, STATE_COLUMNS, STATE_DTYPE
 from harness.families.protocol import Chosen
 from harness.loop.loop import EpisodeLoop, RecordPolicy
 from harness.loop.repeat import Traffic
 from harness.records.schemas import episodes_table
 from harness.resolved import resolve
-from harness.vocabulary import CONTACT, CRASH, CUT_IN, PASSED, STATE_COLUMNS, STATE_DTYPE, TIMEOUT
+from harness.vocabulary import CONTACT, CRASH, PASSED, TIMEOUT
 from harness.worlds.twin import TwinWorld
 from tests.episode.twin_runs import campaign, run
 from tests.golden.campaigns import LATERAL_FILE

@@ -7,7 +7,7 @@ For the step mixture the mean weight is a diagnostic and never a test: it is 0.0
 import numpy as np
 import pytest
 
-from harness.vocabulary import CUT_IN
+from harness.families.cut_in.vocabulary import CUT_IN
 from tests.episode.twin_runs import Mean, run
 
 N = 12_000

@@ -17,8 +17,8 @@ from harness.campaign.campaign import Campaign
 from harness.families.cut_in.nade.functions import as_challenge, harmless_cells
 from harness.families.cut_in.nade.grid import interpolate_maneuvers
 from harness.families.cut_in.nade.tables import Tables
+from harness.families.cut_in.vocabulary import CUT_IN, STATE_COLUMNS, STAY
 from harness.vehicles.kinematics import CONTACT_M
-from harness.vocabulary import CUT_IN, STATE_COLUMNS, STAY
 from tests.episode.twin_runs import prepared, run
 from tests.kernels import accumulated, after_cut_in, before_event, drawn
 

@@ -10,9 +10,9 @@ from harness.families.cut_in.nade.challenge import COLLIDED, LEVELS, LONG, trans
 from harness.families.cut_in.nade.grid import AFTER, GridPoints, points_of
 from harness.families.cut_in.nade.own import own_challenge, own_surrogate, states_after
 from harness.families.cut_in.nade.tables import tables_name
+from harness.families.cut_in.vocabulary import ACCELERATIONS_MPS2
 from harness.resolved import resolve
 from harness.vehicles.drivers import driver_records
-from harness.vocabulary import ACCELERATIONS_MPS2
 from tests.kernels import environment
 from tests.stored_runs import edit
 

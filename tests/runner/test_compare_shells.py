@@ -216,7 +216,7 @@ def test_it_ends_when_it_is_known_who_crashes_less_often(campaigns, done, tmp_pa
         ),
         ((*SHELLS, "world.engine=sumo"), "av={sumo: {carFollowModel: ACC}}", "Nothing in the harness limits"),
         ((*SHELLS, "accept.crash_rate_below=1e-7"), HARDER, "a limit of one crash rate"),
-        (SHELLS, "av={controller: 'tests.controllers.early:Speeds', before_event: controller}", "cut-ins of its own"),
+        (SHELLS, "av={controller: 'tests.controllers.early:Speeds', before_event: controller}", "events of its own"),
         (SHELLS, "testing.epsilon=0.2", r"^testing\.epsilon"),
     ],
 )

@@ -18,9 +18,10 @@ from harness.families.cut_in.fitting.observations import observe
 from harness.families.cut_in.laws import Environment
 from harness.families.cut_in.loading import evaluate_laws, load_environment, load_parameters
 from harness.families.cut_in.parameters import SHIPPED_FOLDER
+from harness.families.cut_in.vocabulary import ACCELERATIONS_MPS2
 from harness.fitting.table import load_mapping, recordings
 from harness.progress import Progress
-from harness.vocabulary import ACCELERATIONS_MPS2, FloatArray
+from harness.vocabulary import FloatArray
 from studies import roundtrip
 from studies.__main__ import main
 from studies.traffic import beside_published

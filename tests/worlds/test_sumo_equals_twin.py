@@ -20,12 +20,13 @@ import pytest
 
 from harness.campaign.yaml_text import yaml_text
 from harness.families.cut_in.nade.in_loop import DrawnInLoop, InLoop
+from harness.families.cut_in.vocabulary import STATE_DTYPE
 from harness.loop.loop import Shard
 from harness.progress import Progress
 from harness.resolved import resolve
 from harness.sampling import prepare
 from harness.vehicles.kinematics import STEP_S, next_position
-from harness.vocabulary import AV, BV, CONTACT, CRASH, LV, PASSED, STATE_DTYPE, VEHICLES
+from harness.vocabulary import AV, BV, CONTACT, CRASH, LV, PASSED, VEHICLES
 from harness.worlds.twin import TwinWorld
 from tests.golden.campaigns import LATERAL
 from tests.traffic.tables import tabled

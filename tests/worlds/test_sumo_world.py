@@ -11,10 +11,11 @@ import numpy as np
 import pytest
 
 from harness.errors import EXIT_TOO_MANY_FAILED, CampaignError, WorldDisagreementError
+from harness.families.cut_in.vocabulary import STATE_DTYPE
 from harness.loop.loop import EpisodeLoop, RecordPolicy, Shard
 from harness.resolved import resolve
 from harness.sampling import prepare
-from harness.vocabulary import BV, CONTACT, CRASH, LV, STATE_DTYPE, TIMEOUT, VEHICLES
+from harness.vocabulary import BV, CONTACT, CRASH, LV, TIMEOUT, VEHICLES
 from harness.worlds import sumo
 from harness.worlds.sumo import open_shim, shim_library
 from harness.worlds.twin import TwinWorld

@@ -18,11 +18,12 @@ from harness.families.cut_in import laws
 from harness.families.cut_in.lateral import draw_lead
 from harness.families.cut_in.laws import Environment
 from harness.families.cut_in.path import Trajectory, empty_trajectory, leave, state_of, walk, weigh_cut_ins, who_crashes
+from harness.families.cut_in.vocabulary import CUT_IN
 from harness.families.protocol import HOLDING, Events, Paths, Recorded
 from harness.random_stream import LV_DRAWS, uniform
 from harness.vehicles.drivers import Followers
 from harness.vehicles.kinematics import CONTACT_M, gap, next_speed
-from harness.vocabulary import AV, CUT_IN, LV, Int8Array, IntArray
+from harness.vocabulary import AV, LV, Int8Array, IntArray
 
 FREE_DRAWS_PER_CUT_IN = 256
 """Stride of the uniforms for BV's free driving: each cut-in time of a path of a pool has draws of its own."""

@@ -19,10 +19,11 @@ from harness.families.cut_in.parameters import DEFAULT, EnvironmentParameters
 from harness.families.cut_in.path import empty_trajectory, mean_test_distance
 from harness.families.cut_in.replay import avoids, drive_along
 from harness.families.cut_in.script import facts_of, script_of
+from harness.families.cut_in.vocabulary import STATE_COLUMNS
 from harness.families.cut_in.words import AT_OVERLAP, STAND_INS, WORDS
 from harness.families.protocol import Chosen, Column, Exposure, Family, Paths
 from harness.families.words import CLOSING
-from harness.vocabulary import BV, LV, STATE_COLUMNS, VEHICLES, BoolArray, FloatArray, IntArray, RecordArray
+from harness.vocabulary import BV, LV, VEHICLES, BoolArray, FloatArray, IntArray, RecordArray
 
 STATE_FACTS = (
     Column("v_bv_mps", pa.float64(), "m/s", "speed of BV"),

@@ -29,9 +29,10 @@ from scipy import special
 from harness import elementary
 from harness.compiled import compiled_inline
 from harness.families.cut_in.lateral import LateralMotion
+from harness.families.cut_in.vocabulary import ACCELERATIONS_MPS2, N_ACCELERATIONS, State, states_from
 from harness.families.flow import Flow
 from harness.random_stream import INITIAL, uniforms
-from harness.vocabulary import ACCELERATIONS_MPS2, N_ACCELERATIONS, FloatArray, Record, RecordArray, State, states_from
+from harness.vocabulary import FloatArray, Record, RecordArray
 
 FREE_DRIVING, CAR_FOLLOWING = 0, 1
 """Which table of noise a law has."""

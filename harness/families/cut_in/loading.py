@@ -20,8 +20,9 @@ from harness.families.cut_in import laws
 from harness.families.cut_in.lateral import constant_lead
 from harness.families.cut_in.laws import Environment, InitialStates, Wish, build_environment
 from harness.families.cut_in.parameters import DEFAULT, SHIPPED_FOLDER, EnvironmentParameters, parameter_record
+from harness.families.cut_in.vocabulary import N_ACCELERATIONS, State
 from harness.families.flow import PROBABILITIES, require
-from harness.vocabulary import N_ACCELERATIONS, FloatArray, State
+from harness.vocabulary import FloatArray
 
 RARE = PROBABILITIES.size - 2
 FASTEST_LV_MPS = 100.0

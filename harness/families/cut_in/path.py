@@ -15,12 +15,13 @@ import numpy as np
 from harness.compiled import compiled_inline, compiled_threads
 from harness.families.cut_in import laws
 from harness.families.cut_in.laws import Environment, acceleration
+from harness.families.cut_in.vocabulary import State
 from harness.random_stream import BV_DRAWS, BV_FREE_DRAWS, LV_DRAWS, uniform
 from harness.vehicles.drivers import MOST_FOLLOWERS, Followers
 from harness.vehicles.kinematics import CONTACT_M, STEP_S, VEHICLE_LENGTH_M, gap, next_position, next_speed, overlaps
 from harness.vehicles.references import Memory, react, still_cruises
 from harness.vehicles.sideways import onset_of, perceived_in
-from harness.vocabulary import AV, BV, CONTACT, LV, PASSED, RUNNING, FloatArray, Int8Array, Record, RecordArray, State
+from harness.vocabulary import AV, BV, CONTACT, LV, PASSED, RUNNING, FloatArray, Int8Array, Record, RecordArray
 
 AV_START_M = 100.0
 NO_CRASH, WAS_AHEAD, FOLLOWS = -1, -2, -3

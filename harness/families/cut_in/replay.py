@@ -17,9 +17,10 @@ from harness.families.cut_in.events import Maneuvers
 from harness.families.cut_in.laws import Environment
 from harness.families.cut_in.path import NO_CRASH, Trajectory, empty_trajectory, follow, leave, take_over, walk
 from harness.families.cut_in.script import facts_of, maneuvers_of, states_of
+from harness.families.cut_in.vocabulary import ACCELERATIONS_MPS2, CUT_IN, states_from
 from harness.families.protocol import Chosen, Driven
 from harness.vehicles.sideways import onset_of
-from harness.vocabulary import ACCELERATIONS_MPS2, AV, CUT_IN, BoolArray, FloatArray, IntArray, RecordArray, states_from
+from harness.vocabulary import AV, BoolArray, FloatArray, IntArray, RecordArray
 
 
 class StoredPaths(NamedTuple):

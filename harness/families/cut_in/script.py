@@ -10,10 +10,11 @@ from harness.compiled import compiled_threads, unboxed
 from harness.families.cut_in.events import Maneuvers
 from harness.families.cut_in.laws import Environment, acceleration
 from harness.families.cut_in.path import place
+from harness.families.cut_in.vocabulary import STATE_COLUMNS, states_from
 from harness.families.protocol import Chosen
 from harness.families.script import Script, natural_script
 from harness.vehicles.kinematics import next_speed
-from harness.vocabulary import AV, BV, LV, STATE_COLUMNS, FloatArray, Int8Array, IntArray, RecordArray, states_from
+from harness.vocabulary import AV, BV, LV, FloatArray, Int8Array, IntArray, RecordArray
 
 LEFT, RIGHT = 1, 0
 _LENGTHS = {"lv_maneuvers": "n_lv", "bv_maneuvers": "n_bv"}

@@ -16,8 +16,9 @@ from scipy import sparse, special
 
 from harness.families.cut_in.fitting.maximum import LogLikelihood, Maximum, Prior, maximise
 from harness.families.cut_in.fitting.observations import KINDS, Observations
+from harness.families.cut_in.vocabulary import ACCELERATIONS_MPS2, N_ACCELERATIONS
 from harness.vehicles.kinematics import STEP_S
-from harness.vocabulary import ACCELERATIONS_MPS2, N_ACCELERATIONS, BoolArray, FloatArray, IntArray, RecordArray
+from harness.vocabulary import BoolArray, FloatArray, IntArray, RecordArray
 
 BASE = "ndd-overtaking-2"
 """Shipped environment whose numbers are kept where they are not fitted, or the data do not determine them."""

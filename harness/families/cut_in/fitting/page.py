@@ -21,11 +21,12 @@ from harness.families.cut_in.laws import CAR_FOLLOWING, FREE_DRIVING, Environmen
 from harness.families.cut_in.loading import evaluate_laws, load_environment
 from harness.families.cut_in.parameters import SHIPPED_FOLDER, EnvironmentParameters
 from harness.families.cut_in.sections import HAZARD_OF
+from harness.families.cut_in.vocabulary import ACCELERATIONS_MPS2, N_ACCELERATIONS
 from harness.fitting.protocol import Asked
 from harness.numbers import number
 from harness.report.drawing import Plot, PlotAxis, PlotPanel
 from harness.report.templates import templates
-from harness.vocabulary import ACCELERATIONS_MPS2, N_ACCELERATIONS, FloatArray, IntArray, RecordArray
+from harness.vocabulary import FloatArray, IntArray, RecordArray
 
 CONFIDENCE = 0.9
 SHIPPED = {"ndd-overtaking-1": "muted", "ndd-overtaking-2": "vermillion"}

@@ -12,7 +12,8 @@ import numpy as np
 from harness.families.cut_in.laws import Environment
 from harness.families.cut_in.nade.functions import Importance
 from harness.families.cut_in.path import Trajectory, empty_trajectory, lengths
-from harness.vocabulary import N_ACCELERATIONS, STATE_COLUMNS, FloatArray, Int8Array, IntArray, RecordArray
+from harness.families.cut_in.vocabulary import N_ACCELERATIONS, STATE_COLUMNS
+from harness.vocabulary import FloatArray, Int8Array, IntArray, RecordArray
 
 _f8, _i8 = np.float64, np.int64
 

@@ -40,11 +40,12 @@ from harness.families.cut_in import laws
 from harness.families.cut_in.laws import Environment, InitialStates, acceleration
 from harness.families.cut_in.loading import evaluate_laws
 from harness.families.cut_in.nade.grid import AFTER, BEFORE, GridPoints, interpolate, locate, points_of, state_at
+from harness.families.cut_in.vocabulary import N_ACCELERATIONS, STATE_COLUMNS
 from harness.processes import usable_cpus
 from harness.vehicles.drivers import FVDM_KIND, SMALLEST_GAP_M, driver_acceleration, fvdm_acceleration, fvdm_shape
 from harness.vehicles.kinematics import CONTACT_M, STEP_S, next_speed
 from harness.vehicles.references import Memory, react
-from harness.vocabulary import N_ACCELERATIONS, STATE_COLUMNS, Float32Array, FloatArray, Record, RecordArray
+from harness.vocabulary import Float32Array, FloatArray, Record, RecordArray
 
 LEVELS = 12
 """Seconds of remaining time that are told apart; later crashes are counted in the last level."""

@@ -21,8 +21,9 @@ from harness.families.cut_in.laws import Environment, acceptance
 from harness.families.cut_in.nade.challenge import level_of, level_steps
 from harness.families.cut_in.nade.grid import AFTER, BEFORE, interpolate, interpolate_maneuvers, locate
 from harness.families.cut_in.nade.tables import Tables
+from harness.families.cut_in.vocabulary import N_ACCELERATIONS, State
 from harness.vehicles.kinematics import CONTACT_M, STEP_S, next_speed
-from harness.vocabulary import N_ACCELERATIONS, BoolArray, Float32Array, FloatArray, State, read_only
+from harness.vocabulary import BoolArray, Float32Array, FloatArray, read_only
 
 
 class Importance(NamedTuple):

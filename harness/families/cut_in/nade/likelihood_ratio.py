@@ -22,8 +22,9 @@ import math
 from harness.compiled import compiled_inline
 from harness.families.cut_in.nade.cells import NadeKernel
 from harness.families.cut_in.nade.functions import Importance
+from harness.families.cut_in.vocabulary import CUT_IN, STAY, State
 from harness.loop.cells import KernelState
-from harness.vocabulary import CUT_IN, STAY, FloatArray, State
+from harness.vocabulary import FloatArray
 
 
 @compiled_inline

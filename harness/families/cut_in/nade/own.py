@@ -23,8 +23,9 @@ from harness.families.cut_in.laws import Environment
 from harness.families.cut_in.nade.challenge import COLLIDED, LEVELS, induced, level_steps
 from harness.families.cut_in.nade.grid import AFTER, points_of
 from harness.families.cut_in.nade.tables import Tables, recursive_tables
+from harness.families.cut_in.vocabulary import ACCELERATIONS_MPS2, N_ACCELERATIONS
 from harness.vehicles.kinematics import CONTACT_M, STEP_S, VEHICLE_LENGTH_M
-from harness.vocabulary import ACCELERATIONS_MPS2, N_ACCELERATIONS, FloatArray, RecordArray, read_only
+from harness.vocabulary import FloatArray, RecordArray, read_only
 
 WHERE = "testing.challenge"
 
