@@ -34,7 +34,9 @@ LEAST_MOVE = 0.01
     help=f"Only this one: {', '.join(ESTIMATORS)}, or your own, my.py:MyEstimator. May be given several times.",
 )  # fmt: skip
 @click.option("--confidence", type=click.FloatRange(0.01, 0.999999999), help="Level of intervals.")
-@click.option("--write", is_flag=True, help="Write the result to DIR/estimates.json; what answers stays.")
+@click.option(
+    "--write", is_flag=True, help="Write the result into DIR; of several scenarios the page, too. What answers stays."
+)
 @click.option(
     "--environment", metavar="NAME|FILE",
     help="Answer for other traffic from the same tests (testing.method shells): a shipped environment, or a file.",

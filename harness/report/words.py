@@ -41,7 +41,6 @@ ENDED = {
     "sum": "with the sum of all scenarios",
 }
 """Why a campaign ended (`harness.vocabulary.StoppedBy`), in words."""
-"""What to do where a verdict is open, or the asked precision not reached."""
 
 
 def ended_words(stopped_by: str | None, decision: Mapping[str, Any] | None) -> str:
@@ -153,9 +152,9 @@ def warnings_of(scenario: str, of: Mapping[str, Any], unit: str, but: str = "") 
         again = count(repeated["n_episodes"])
         yield f"NOT REPRODUCIBLE: {count(n)} of {again} tests that ran twice differed: see `harness av-check`"
     if n := of["n_failed"]:
-        tests, had = count(of["n_episodes"]), f"{number(of['if_failed_had_crashed'])}{unit}"
+        failed, had = f"{count(n)} of {count(of['n_episodes'])}", f"{number(of['if_failed_had_crashed'])}{unit}"
         why = f"; most with: {of['failure']}" if of.get("failure") else ""
-        yield f"{count(n)} of {tests} tests FAILED; had they all crashed, the rate would be {had}{why}"
+        yield f"{failed} tests FAILED; had they all crashed, as upper limits assume, the rate would be {had}{why}"
     worst = of["rate"] + of["cut_off"]
     if worst > max((1.0 + CUT_OFF_SHARE) * of["rate"], of["ci_high"]):
         ended = f"tests, as test {of['cut_off_test']}, ended while the vehicle was still closing in"

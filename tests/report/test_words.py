@@ -19,7 +19,10 @@ from tests.stored_runs import answer_in, estimates, golden
 SAID = {
     "nde-twin": ["lane_change_level is 3,000,000: compare only with", "impact speed "],
     "step-recursive-twin": ["the true rate may lie far above this interval: a crash may weigh 1.00 × 10²⁰⁰, and all"],
-    "forced-failing-twin": [" of 240 tests FAILED; had they all crashed, the rate would be ", "; most with: "],
+    "forced-failing-twin": [
+        " of 240 tests FAILED; had they all crashed, as upper limits assume, the rate would be ",
+        "; most with: ",
+    ],
     "shells-twin": ["crash rate  ", "× competent driver  ", "r157-cc, UN R157’s driver", "even by braking at 8 m/s²"],
     "shells-accepted": [
         "ACCEPTED ",
