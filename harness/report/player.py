@@ -7,6 +7,7 @@ there on. What the vehicle ahead does after it was hit is drawn as if it had not
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -259,7 +260,7 @@ def _facts(scene: Scene, event: str) -> list[tuple[str, str]]:
     bv, av, words = scene["tracks"][family.principal], scene["tracks"][-1], family.words
     first, onset, cut = scene["first"], scene["onset"], scene["event"]
     if onset is None:
-        return [(words.shows[0], words.none)]
+        return [(words.shows[0], words.none), *_early(av, scene["tracks"][:-1])]
     rate, hardest = _closing(av, bv, cut - first), tenths(-float(np.diff(av["v"]).min()) / STEP_S)
     where = f"{tenths(_gap(av, bv, cut - first))} m ahead and {tenths(abs(rate))} m/s "
     where += "slower" if rate > 0.0 else "faster"
@@ -282,6 +283,15 @@ def _facts(scene: Scene, event: str) -> list[tuple[str, str]]:
             who += f", {tenths(ahead / each['v'][at])} s behind at the onset"
         facts.append((each["name"], f"{who}: {_ending(each, scene)}"))
     return facts
+
+
+def _early(av: Scene, others: Sequence[Scene]) -> Iterator[tuple[str, str]]:
+    """A crash before anything has happened."""
+    if (end := av["crash"]) is not None:
+        ahead = min(others, key=lambda each: abs(_gap(av, each, end)))
+        v, v_ahead, impact = (tenths(of) for of in (av["v"][end], ahead["v"][end], _closing(av, ahead, end)))
+        speeds = f"it drives {v} m/s, {ahead['name']} {v_ahead} m/s: impact {impact} m/s"
+        yield "AV", f"crashes at {STEP_S * end:.1f} s, before anything happens: strikes {ahead['name']}; {speeds}"
 
 
 def _ending(track: Scene, scene: Scene) -> str:

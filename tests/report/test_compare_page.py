@@ -128,3 +128,10 @@ def test_who_crashes_before_the_event_is_compared_and_shown(tmp_path):
         found = harness.compare(a, b, tmp_path / "pair", workers=1)
     assert found.content["n_only_a"] > 10
     assert '"does not crash"' in found.report.read_text()
+    with controllers_here():
+        facts = harness.replay(tmp_path / "pair" / "a").scene["facts"]
+    impact = harness.replay(tmp_path / "pair" / "a", stored=True).row["impact_speed_mps"]
+    assert facts[0] == ("LV", "Nobody left the lane.")
+    assert re.fullmatch(
+        rf"crashes at [\d.]+ s, before anything happens: strikes LV; .* impact {impact:.1f} m/s", facts[1][1]
+    )
