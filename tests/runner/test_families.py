@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 import harness
+from harness.campaign.files import dump_campaign
 from harness.campaign.sections import EXPOSURES
 from harness.cli import main
 from harness.errors import CampaignError, HarnessError, RunFolderError
@@ -25,6 +26,7 @@ from harness.report.several import hour_lines
 from harness.resolved import resolve
 from harness.runner import other_traffic
 from harness.runner.compare import compare_campaigns
+from harness.runner.run import require_same_shares
 from harness.runner.stored import estimate_families
 from tests.in_process import one_process, run_here, run_with_workers, without_page
 from tests.stored_runs import copy_of
@@ -120,6 +122,15 @@ def test_what_would_allocate_other_tests_is_refused_before_one_is_run(run, other
     with pytest.raises(RunFolderError, match=told):
         harness.run(campaign("stop.rhw=0.5", *other), run.folder, resume=True)
     assert {file: file.read_bytes() for file in run.folder.rglob("*") if file.is_file()} == kept
+
+
+def test_no_estimate_is_offered_that_would_keep_an_exposure_taken_away(tmp_path):
+    (tmp_path / "campaign.yaml").write_text(dump_campaign(campaign("exposure.cut_out=0.01")))
+    require_same_shares(tmp_path, campaign("exposure.cut_out=0.01", "stop.rhw=0.5"))
+    with pytest.raises(
+        RunFolderError, match=r"cut_out=0\.01; expected exposure as shipped\. Repeat it, or choose another"
+    ):
+        require_same_shares(tmp_path, campaign())
 
 
 @pytest.mark.slow
