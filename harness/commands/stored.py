@@ -35,7 +35,7 @@ LEAST_MOVE = 0.01
 )  # fmt: skip
 @click.option("--confidence", type=click.FloatRange(0.01, 0.999999999), help="Level of intervals.")
 @click.option(
-    "--write", is_flag=True, help="Write the result into DIR; of several scenarios the page, too. What answers stays."
+    "--write", is_flag=True, help="Write the result into DIR, of several scenarios the page, too; the headline stays."
 )
 @click.option(
     "--environment", metavar="NAME|FILE",

@@ -223,13 +223,13 @@ def _columns(family: Family, *, sees: bool) -> tuple[list[str], list[str]]:
 
 def hardest_crash(folder: Path, manifest: Mapping[str, Any]) -> int:
     """Number of the run's crash at the largest impact speed, the first of equals; a `RunFolderError` without any."""
-    columns = ["episode", "impact_speed_mps"]  # null but of crashes
-    tables = [read_kept(folder, part, "episodes", columns).drop_null() for part in manifest["parts"]]
-    crashes = pa.concat_tables(tables).sort_by([("impact_speed_mps", "descending"), ("episode", "ascending")])
-    if not crashes.num_rows:
-        raise RunFolderError(
-            str(folder), "no crash", "the number of a test to replay", "Name one: harness replay DIR 0."
-        )
+    if not manifest["parts"]:
+        raise no_episodes(folder)
+    columns, key = ["impact_speed_mps", "episode"], [("impact_speed_mps", "descending"), ("episode", "ascending")]
+    tables = [read_kept(folder, part, "episodes", columns).drop_null() for part in manifest["parts"]]  # null: no crash
+    if not (crashes := pa.concat_tables(tables).sort_by(key)).num_rows:
+        expected, mend = "the number of a test to replay", "Name one: harness replay DIR 0."
+        raise RunFolderError(str(folder), "no crash", expected, mend)
     return int(crashes["episode"][0].as_py())
 
 
