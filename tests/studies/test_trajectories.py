@@ -21,7 +21,6 @@ from harness.families.cut_in.parameters import SHIPPED_FOLDER
 from harness.families.cut_in.vocabulary import ACCELERATIONS_MPS2
 from harness.fitting.table import load_mapping, recordings
 from harness.progress import Progress
-from harness.vocabulary import FloatArray
 from studies import roundtrip
 from studies.__main__ import main
 from studies.traffic import beside_published
@@ -197,15 +196,10 @@ def test_traffic_is_fitted_whose_speed_differences_are_as_wide_as_on_motorways_a
 
 def test_shares_of_one_step_do_not_lean_on_those_of_others() -> None:
     """More lane changes at the shortest times than at the next ones are chance, where nobody looks."""
-
-    class Counted(Acceptance):
-        def exposures(self, theta: FloatArray) -> FloatArray:
-            return np.broadcast_to(self.exposure[:-1], (len(theta), 5))
-
-    nothing = np.empty((0, 0)), np.empty(0, np.int64), np.empty(0)
-    counts = Counted(np.array([9, 1, 0, 13, 84, 900]), np.array([45.0, 45.0, 44.0, 78.0, 99.0, 900.0]), *nothing)
+    exposure = np.array([45.0, 45.0, 44.0, 78.0, 99.0, 900.0])
+    counts = Acceptance(np.array([9, 1, 0, 13, 84, 900]), exposure, np.zeros((5, 1)), np.arange(5), exposure[:5])
     assert counts.shares == pytest.approx([9 / 45, 1 / 45, 0.5 / 44, 13 / 78, 84 / 99, 1.0])
-    drawn = counts.drawn(np.empty((20_000, 1)), np.random.default_rng(1))
+    drawn = counts.drawn(np.zeros((20_000, 1)), np.random.default_rng(1))
     for step, (k, exposure) in enumerate(zip(counts.events[:-1], counts.exposure, strict=False)):
         expected = gamma.ppf([0.05, 0.95], k + 0.5) / exposure
         assert np.quantile(drawn[:, step], [0.05, 0.95]) == pytest.approx(np.minimum(expected, 1.0), rel=0.1)
