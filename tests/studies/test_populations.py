@@ -174,15 +174,15 @@ def test_counted_tests_say_what_their_records_would(with_references, shadow_runs
         added = by_row.next_round()
         assert by_row.enough(as_block(drawn, *drawn.tests_of(added, rng), n)) == enough
         n += int(added.sum())
-        numbers = ((*tally[:5], *(tally.runs or ())) for tally in (seen.tally, by_row.tally))
+        numbers = ((*tally[:5], *(tally.runs or ())) for tally in (seen.tally, by_row.seen.tally))
         for one, other in zip(*numbers, strict=True):
             np.testing.assert_allclose(one, other, rtol=1e-12)
         limits = by_row.seen.limits(level)
         assert seen.limits(level) == pytest.approx(limits, rel=1e-12)
     assert n == 2_000
-    of_all = combined(design.p, by_row.tally, design.n_independent, level)
+    of_all = combined(design.p, by_row.seen.tally, design.n_independent, level)
     assert limits == of_all  # not of an earlier look
-    assert by_row.tally.totals[2] > 40
+    assert by_row.seen.tally.totals[2] > 40
     found, expected = (as_tree(each.result(0.9)) for each in (seen, by_row.seen))
     assert unlike(found, expected, digits=1e-12) == []
 
