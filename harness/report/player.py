@@ -7,7 +7,6 @@ there on. What the vehicle ahead does after it was hit is drawn as if it had not
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -183,7 +182,7 @@ def beside_other(scene: Scene, label: str, other: str, trace: pa.Table | None) -
             bv[key] = np.append(bv[key], goes_on[key][crash + 1 : shown])
             ghost[key] = ghost[key][first:shown]
         ghosts.append(ghost | {"name": other, "crash": None, "brakes": _brakes(ghost["v"], first)})
-        told[other] = "does not crash" if scene["event"] is None else _ending(ghosts[0], scene)
+        told[other] = _ending(ghosts[0], scene)
     facts = [(name.replace("AV", label), phrase) for name, phrase in scene["facts"]]
     moments = [(step, name.replace("AV", label)) for step, name in scene["moments"]]
     av["label"] = label
@@ -260,7 +259,7 @@ def _facts(scene: Scene, event: str) -> list[tuple[str, str]]:
     bv, av, words = scene["tracks"][family.principal], scene["tracks"][-1], family.words
     first, onset, cut = scene["first"], scene["onset"], scene["event"]
     if onset is None:
-        return [(words.shows[0], words.none), *_early(av, scene["tracks"][:-1])]
+        return [(words.shows[0], words.none), *[("AV", _ending(av, scene))] * (av["crash"] is not None)]
     rate, hardest = _closing(av, bv, cut - first), tenths(-float(np.diff(av["v"]).min()) / STEP_S)
     where = f"{tenths(_gap(av, bv, cut - first))} m ahead and {tenths(abs(rate))} m/s "
     where += "slower" if rate > 0.0 else "faster"
@@ -285,35 +284,28 @@ def _facts(scene: Scene, event: str) -> list[tuple[str, str]]:
     return facts
 
 
-def _early(av: Scene, others: Sequence[Scene]) -> Iterator[tuple[str, str]]:
-    """A crash before anything has happened."""
-    if (end := av["crash"]) is not None:
-        ahead = min(others, key=lambda each: abs(_gap(av, each, end)))
-        v, v_ahead, impact = (tenths(of) for of in (av["v"][end], ahead["v"][end], _closing(av, ahead, end)))
-        speeds = f"it drives {v} m/s, {ahead['name']} {v_ahead} m/s: impact {impact} m/s"
-        yield "AV", f"crashes at {STEP_S * end:.1f} s, before anything happens: strikes {ahead['name']}; {speeds}"
-
-
 def _ending(track: Scene, scene: Scene) -> str:
-    """How it ends for one who follows the principal vehicle from its event on."""
-    family = family_named(scene["scenario"])
-    bv, name = scene["tracks"][family.principal], scene["principal"]
+    """How it ends for one who follows the principal vehicle from its event on, or who crashes before it."""
+    family, others = family_named(scene["scenario"]), scene["tracks"][:-1]
     first, cut, crash = scene["first"], scene["event"], track["crash"]
+    early, bv = scene["onset"] is None, others[family.principal]
     if crash is None:
-        places = range(cut + 1 - first, min(len(track["x"]), len(bv["x"])))
+        places = () if early else range(cut + 1 - first, min(len(track["x"]), len(bv["x"])))
         if not places:  # it has ended before the event, by an impact too soft to count
             return "does not crash"
         closest, end = min(_gap(track, bv, place) for place in places), places[-1]
         gap = f"{tenths(closest)} m" if closest >= 0.05 else "< 0.1 m"
         if (rate := _closing(track, bv, end)) > 0.0 and _gap(track, bv, end) < rate * UNDECIDED_S:
-            return f"no crash until the test ends, {gap} behind {name} and still {tenths(rate)} m/s faster"
+            return f"no crash until the test ends, {gap} behind {bv['name']} and still {tenths(rate)} m/s faster"
         return f"avoids it, {gap} at the closest" + f" since {family.words.since}" * bool(scene["onset"] < cut)
-    v, v_bv = (tenths(float(each["v"][crash - first])) for each in (track, bv))
-    from_the_side = family.crosses == family.principal and scene["onset"] < cut and crash == cut + 1
-    who = f"{name} moves sideways into it" if from_the_side else f"strikes {name} from behind"
-    impact = tenths(_closing(track, bv, crash - first))
-    speeds = f"it drives {v} m/s, {name} {v_bv} m/s"
-    return f"crashes at {_when(crash, cut, family.words.since)}: {who}; {speeds}: impact {impact} m/s"
+    at = crash - first
+    bv = min(others, key=lambda each: abs(_gap(track, each, at))) if early else bv
+    v, v_bv = (tenths(float(each["v"][at])) for each in (track, bv))
+    from_the_side = not early and family.crosses == family.principal and scene["onset"] < cut and crash == cut + 1
+    who = f"{bv['name']} moves sideways into it" if from_the_side else f"strikes {bv['name']} from behind"
+    when = f"{STEP_S * crash:.1f} s, before anything happens" if early else _when(crash, cut, family.words.since)
+    speeds = f"it drives {v} m/s, {bv['name']} {v_bv} m/s"
+    return f"crashes at {when}: {who}; {speeds}: impact {tenths(_closing(track, bv, at))} m/s"
 
 
 def _gap(track: Scene, bv: Scene, place: int) -> float:

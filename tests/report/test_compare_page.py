@@ -133,5 +133,5 @@ def test_who_crashes_before_the_event_is_compared_and_shown(tmp_path):
     impact = harness.replay(tmp_path / "pair" / "a", stored=True).row["impact_speed_mps"]
     assert facts[0] == ("LV", "Nobody left the lane.")
     assert re.fullmatch(
-        rf"crashes at [\d.]+ s, before anything happens: strikes LV; .* impact {impact:.1f} m/s", facts[1][1]
+        rf"crashes at [\d.]+ s, before anything happens: strikes LV .*: impact {impact:.1f} m/s", facts[1][1]
     )
