@@ -261,8 +261,9 @@ def _facts(scene: Scene, event: str) -> list[tuple[str, str]]:
     if onset is None:
         return [(words.shows[0], words.none), *[("AV", _ending(av, scene))] * (av["crash"] is not None)]
     rate, hardest = _closing(av, bv, cut - first), tenths(-float(np.diff(av["v"]).min()) / STEP_S)
-    where = f"{tenths(_gap(av, bv, cut - first))} m ahead and {tenths(abs(rate))} m/s "
-    where += "slower" if rate > 0.0 else "faster"
+    ahead, passed = _gap(av, bv, cut - first), _gap(bv, av, cut - first)
+    where = f"{tenths(ahead)} m ahead" if passed < 0.0 else f"{tenths(passed)} m behind"
+    where += f" and {tenths(abs(rate))} m/s {'slower' if rate > 0.0 else 'faster'}"
     shows = event or f"{tenths(_gap(av, bv, onset - first))} m ahead"
     told = {
         " ".join(words.happens): where if bv["name"] == words.happens[0] else f"{bv['name']} is {where}",
@@ -293,7 +294,11 @@ def _ending(track: Scene, scene: Scene) -> str:
         places = () if early else range(cut + 1 - first, min(len(track["x"]), len(bv["x"])))
         if not places:  # it has ended before the event, by an impact too soft to count
             return "does not crash"
-        closest, end = min(_gap(track, bv, place) for place in places), places[-1]
+        (closest, nearest), end = min((_gap(track, bv, place), place) for place in places), places[-1]
+        if _gap(bv, track, end) >= 0.0:
+            return f"has passed {bv['name']}"
+        if closest < 0.0:
+            return f"touches {bv['name']} at {tenths(_closing(track, bv, nearest))} m/s, too softly to count"
         gap = f"{tenths(closest)} m" if closest >= 0.05 else "< 0.1 m"
         if (rate := _closing(track, bv, end)) > 0.0 and _gap(track, bv, end) < rate * UNDECIDED_S:
             return f"no crash until the test ends, {gap} behind {bv['name']} and still {tenths(rate)} m/s faster"

@@ -146,6 +146,8 @@ def test_without_a_number_the_hardest_crash_is_replayed(stored_run, tmp_path, ca
         (20.0, 7.0, 0, "avoids it, 2.0 m at the closest"),
         (20.0, 7.0, -1, "avoids it, 2.0 m at the closest since BV entered the lane"),
         (20.0, 5.02, 0, "avoids it, < 0.1 m at the closest"),
+        (21.0, 5.2, 0, "touches BV at 1.0 m/s, too softly to count"),
+        (21.0, -6.0, 0, "has passed BV"),
     ],
 )
 def test_a_test_that_ends_while_the_vehicle_closes_in_has_avoided_nothing(speed, ahead, onset, said):
