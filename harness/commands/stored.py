@@ -282,7 +282,7 @@ def replay(
     machine, that takes --trust.
     """
     from harness.records.folder import read_manifest, require_place
-    from harness.records.reader import code_of, read_campaign
+    from harness.records.reader import code_of, hardest_crash, read_campaign
     from harness.report.motion import gui_program, watch, writer_of
     from harness.runner.stored import code_changed
     from harness.worlds.sumo import sumo_program
@@ -291,6 +291,8 @@ def replay(
     for file in files:  # can be written, before anything is simulated for them
         writer_of(file)
         require_place(file.parent)
+    asked = folder
+    folder, episode = hardest_crash(folder) if episode is None else (folder, episode)
     manifest = read_manifest(folder)
     campaign = read_campaign(folder, manifest, check_files=not stored)
     if not stored and (code := code_of(campaign.av)) is not None:
@@ -298,13 +300,13 @@ def replay(
     program = gui_program() if gui else None
     result = harness.replay(folder, episode, stored=stored, trust=trust)
     written = [each for file in files for each in harness.write_motion(result, file)]
-    episode = int(result.row["episode"])
-    content = {"episode": episode, "outcome": result.outcome, "bit_equal": result.bit_equal}
+    content = {"folder": str(folder), "episode": episode, "outcome": result.outcome, "bit_equal": result.bit_equal}
     content |= {"files": [str(file) for file in written]}
     content |= {name: result.row[name] for name in LATERAL if name in result.row}
     compared = {None: "no stored motion to compare with", True: "bit for bit as stored", False: "NOT as stored"}
     words = "the motion that the run has kept" if stored else compared[result.bit_equal]
     head, *facts = repr(result).splitlines()
+    head = head if folder == asked else f"{folder}, {head}"
     print_either(content, [f"{head}; {words}", *facts, *written], as_json=as_json)
     if not stored and result.bit_equal is not False and (note := code_changed(manifest, campaign)):
         say(f"note: {note}", err=True)

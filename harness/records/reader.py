@@ -30,9 +30,19 @@ from harness.families.numbers import ParameterFile
 from harness.families.protocol import Environment, Family
 from harness.files import content_hash, read_bytes
 from harness.processes import made_ahead
-from harness.records.folder import CAMPAIGN, Part, concatenated, no_episodes, read_kept, read_table, require_sum
+from harness.records.folder import (
+    CAMPAIGN,
+    Part,
+    concatenated,
+    no_episodes,
+    read_kept,
+    read_manifest,
+    read_table,
+    require_sum,
+)
 from harness.records.schemas import LEAD, path_columns
 from harness.resolved import resolve
+from harness.vocabulary import FAMILIES
 
 N_READERS = 2
 """Threads; each holds a part."""
@@ -221,16 +231,24 @@ def _columns(family: Family, *, sees: bool) -> tuple[list[str], list[str]]:
     return [*COLUMNS, *numbers, *in_time, "outcome"], [*path_columns(family), *in_time[:1], "outcome"]
 
 
-def hardest_crash(folder: Path, manifest: Mapping[str, Any]) -> int:
-    """Number of the run's crash at the largest impact speed, the first of equals; a `RunFolderError` without any."""
-    if not manifest["parts"]:
-        raise no_episodes(folder)
-    columns, key = ["impact_speed_mps", "episode"], [("impact_speed_mps", "descending"), ("episode", "ascending")]
-    tables = [read_kept(folder, part, "episodes", columns).drop_null() for part in manifest["parts"]]  # null: no crash
-    if not (crashes := pa.concat_tables(tables).sort_by(key)).num_rows:
+def hardest_crash(folder: Path) -> tuple[Path, int]:
+    """Run folder and number of the crash at the largest impact speed, the first of equals; of a sum, of all its runs.
+
+    Raises `RunFolderError`: there is none.
+    """
+    several, crashes = (folder / FAMILIES).is_file(), list[tuple[float, int, Path]]()
+    for run in [each.parent for each in sorted(folder.glob("*/manifest.json"))] if several else [folder]:
+        if not (parts := read_manifest(run)["parts"]):
+            raise no_episodes(run)
+        for part in parts:
+            columns = read_kept(run, part, "episodes", ["impact_speed_mps", "episode"]).drop_null()  # null: no crash
+            speed_mps, episode = (each.to_pylist() for each in columns.itercolumns())
+            crashes += [(-each, number, run) for each, number in zip(speed_mps, episode, strict=True)]
+    if not crashes:
         expected, mend = "the number of a test to replay", "Name one: harness replay DIR 0."
         raise RunFolderError(str(folder), "no crash", expected, mend)
-    return int(crashes["episode"][0].as_py())
+    _, number, run = min(crashes)
+    return run, number
 
 
 def by_kind(causes: Mapping[str, int]) -> Counter[str]:

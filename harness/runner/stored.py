@@ -162,7 +162,7 @@ def replay_episode(
     Parameters
     ----------
     folder : str or Path
-        Run folder.
+        Run folder; that of several scenarios for the hardest crash of all.
     episode : int, optional
         Index of the test in the campaign, from 0; by default that of the hardest crash.
     stored : bool
@@ -187,9 +187,8 @@ def replay_episode(
       r157-cc            a careful and competent driver: avoids it, 9.1 m at the closest
       brakes-8           braking as soon as it sees BV come over, at up to 8 m/s²: avoids it, 18.7 m at the closest
     """
-    folder = Path(folder)
+    folder, episode = reader.hardest_crash(Path(folder)) if episode is None else (Path(folder), episode)
     manifest = read_manifest(folder)
-    episode = reader.hardest_crash(folder, manifest) if episode is None else episode
     tables = _stored(folder, manifest, episode)
     campaign = read_campaign(folder, manifest, check_files=not stored)
     if not stored:

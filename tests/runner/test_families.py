@@ -242,6 +242,15 @@ def test_where_few_tests_reject_only_the_lower_ends_are_told(run, rhw, low, show
     assert ("crashes so far      > 1.00 × 10⁻³ per hour" in told, ratio, "to 900" in told) == (shown, shown, not shown)
 
 
+def test_the_hardest_crash_of_all_scenarios_is_replayed(run, capsys):
+    tests = {name: harness.read(run.folder / name).episodes(["impact_speed_mps"]) for name in NAMES}
+    hardest = max(NAMES, key=lambda name: tests[name]["impact_speed_mps"].max())
+    number_of = int(tests[hardest]["impact_speed_mps"].argmax())
+    assert main(["replay", str(run.folder), "--stored"]) == 0
+    assert capsys.readouterr().out.startswith(f"{run.folder / hardest}, test {number_of}: crash; ")
+    assert harness.replay(run.folder, stored=True).row["episode"] == number_of
+
+
 def test_what_other_traffic_does_to_a_scenario_is_said_once(run):
     """As in the answer of that scenario alone, but at as many events: there are 1.31 times as many per test, too."""
     content = run.content
