@@ -125,7 +125,7 @@ class AvCheck(ShownInPython):
     idm_behaviour: Behaviour
     speed: Speed
     idm_speed: Speed
-    events: str = "cut-ins"
+    events: str
     follows: Follows | None = None
     idm_follows: Follows | None = None
     script: bool = False

@@ -184,7 +184,7 @@ def _warnings(campaign: Campaign, manifest: Mapping[str, Any], told: Estimates) 
 
 
 NEVER_BRAKED = f"it never braked with {plain(BRAKED_MPS2)} m/s² or more: does it see the other vehicle?"
-BRAKES_BEFORE = "in {} tests it braked with nobody ahead, which makes cut-ins milder"
+BRAKES_BEFORE = "in {} tests it braked with nobody ahead, which makes the event milder"
 
 
 def late_words(*, script: bool) -> str:
