@@ -17,6 +17,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
@@ -67,7 +68,9 @@ def _feed(digest: Any, column: pa.Array) -> None:
     elif pa.types.is_floating(column.type) or pa.types.is_integer(column.type):
         digest.update(pc.fill_null(column, 0).to_numpy(zero_copy_only=False).tobytes())
     else:
-        digest.update(json.dumps(column.to_pylist()).encode())
+        coded = column.dictionary_encode("encode")
+        words = np.array([json.dumps(word) for word in coded.dictionary.to_pylist()], object)
+        digest.update(f"[{', '.join(words[coded.indices.to_numpy()])}]".encode())
 
 
 def tables_of(folder: Path) -> dict[str, dict[str, Any]]:
