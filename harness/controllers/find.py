@@ -65,7 +65,7 @@ def own_code(
     except BaseException as error:  # of asyncio and pytest, too
         cause = f"{name}, whose module cannot be imported ({cause_of(error)})"
         meant = did_you_mean(module_name, [file.stem for file in Path.cwd().glob("*.py")])
-        of_file = "Fix the module." if Path(module_name).exists() else "Put it back, or name another."
+        of_file = f"Fix {module_name}." if Path(module_name).exists() else "Put it back, or name another."
         mend = of_file if is_file else "Name its file, my_av.py:Class, or install it beside the harness."
         raise CampaignError(where, cause, "a Python module that can be imported", meant or mend) from error
     found = getattr(module, class_name, None)
@@ -242,7 +242,8 @@ def _require_controller(made: Any, name: str) -> None:
         expected = "a function step(seen), or a class with step (per vehicle) or step_batch (arrays)"
         mend = "Write def step(self, seen): return 0.0, say: m/s², every 0.1 s (docs/controllers.md)."
         mend = "A function without arguments says what it makes: `def make() -> MyAv:`." if made is None else mend
-        mend = "docs/policies.md has an adapter for what has predict(obs)." if hasattr(made, "predict") else mend
+        wraps = "It has predict: wrap it as docs/policies.md shows (Any agent with `predict`)."
+        mend = wraps if hasattr(made, "predict") else mend
         if meant := nearest("step", [each for each in dir(made) if each[0] != "_" and each != "step"]):
             mend = f"Rename {meant} to step."
         raise CampaignError("av.controller", f"{name} without step", expected, mend)

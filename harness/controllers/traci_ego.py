@@ -66,6 +66,8 @@ def script_maker(av: AutomatedVehicle, guard: Guard) -> Callable[[], ScriptContr
                 if line is not None and f"(line {line[1]})" not in lacking:
                     mend = f"Fix the script in that line. {mend}"
             mend += other if "is not known" in wrong else ""
+            if re.search("unknown url type|FileNotFoundError", wrong):  # so says sumolib.net.readNet
+                mend += " A file that it reads itself must be there; the road is straight, of two lanes."
         raise CampaignError("av.controller", found, expected, mend)
 
     def vehicle(set_speed_mps: float, lv_name: str, bv_name: str) -> VehicleDomain:

@@ -140,8 +140,10 @@ class Scenes:
             "tracks": tracks, "ghosts": ghosts,
             "moments": sorted(each for each in moments if each[0] is not None),
         }  # fmt: skip
-        told = self._family.told(row.to_pylist()[0]) if onset is not None else ""
-        return {**scene, "facts": _facts(scene, told)}
+        (of_test,) = row.to_pylist()
+        told = self._family.told(of_test) if onset is not None else ""
+        cause = of_test.get("failure")  # pages show none that failed
+        return {**scene, "facts": _facts(scene, told, cause and f"FAILS at {STEP_S * last:.1f} s: {cause}")}
 
     def _ghosts(
         self, environment: Environment, row: pa.Table, trace: pa.Table, onset: int, bv: Scene, av: Scene
@@ -253,13 +255,14 @@ def _brakes(v: FloatArray, first: int) -> int | None:
     return first + int(braking[0]) if braking.size else None
 
 
-def _facts(scene: Scene, event: str) -> list[tuple[str, str]]:
-    """What happens, as pairs of a name and a phrase; the ``event`` is told by its columns."""
+def _facts(scene: Scene, event: str, failed: str | None) -> list[tuple[str, str]]:
+    """What happens, as pairs of a name and a phrase: of the ``event`` by its columns, and how the AV ``failed``."""
     family = family_named(scene["scenario"])
     bv, av, words = scene["tracks"][family.principal], scene["tracks"][-1], family.words
     first, onset, cut = scene["first"], scene["onset"], scene["event"]
     if onset is None:
-        return [(words.shows[0], words.none), *[("AV", _ending(av, scene))] * (av["crash"] is not None)]
+        ends = failed or (_ending(av, scene) if av["crash"] is not None else "")
+        return [(words.shows[0], words.none), *[("AV", ends)] * bool(ends)]
     rate, hardest = _closing(av, bv, cut - first), tenths(-float(np.diff(av["v"]).min()) / STEP_S)
     ahead, passed = _gap(av, bv, cut - first), _gap(bv, av, cut - first)
     where = f"{tenths(ahead)} m ahead" if passed < 0.0 else f"{tenths(passed)} m behind"
@@ -275,13 +278,13 @@ def _facts(scene: Scene, event: str) -> list[tuple[str, str]]:
     times = [ends if step == cut and family.crosses >= 0 else _when(step, cut, words.since) for step, _ in moments]
     facts = [(name, f"{when}: {told[name]}") for when, (_, name) in zip(times, moments, strict=True)]
     facts += [("AV brakes", "never")] if av["brakes"] is None else []
-    facts.append(("AV", _ending(av, scene)))
-    for each in scene["ghosts"]:
-        who, at = family.stand_ins[each["name"]][0], onset - first
+    for each in (av, *scene["ghosts"]):
+        who, at = [family.stand_ins[each["name"]][0]] if each is not av else [], onset - first
         if family.follows:  # how it ends may hang on nothing else
             ahead = min(_gap(each, other, at) for other in scene["tracks"][:-1])
-            who += f", {tenths(ahead / each['v'][at])} s behind at the onset"
-        facts.append((each["name"], f"{who}: {_ending(each, scene)}"))
+            who.append(f"{tenths(ahead / each['v'][at])} s behind at the onset")
+        ends = (each is av and failed) or _ending(each, scene)
+        facts.append((each["name"], ": ".join(filter(None, (", ".join(who), ends)))))
     return facts
 
 

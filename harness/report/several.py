@@ -154,6 +154,9 @@ def between(low: float, high: float | None, rate: float) -> str:
 def _scope(content: Mapping[str, Any]) -> str:
     """How far the interval goes, and why the tests ended."""
     ended, target = words.ended_words(content["stopped_by"], content["decision"]), content["asked_rhw"]
+    if content["stopped_by"] == "rhw" and (rhw := content["per_hour"]["rhw"] or math.inf) > 1.005 * target:
+        here = words.reached_words(rhw, share(rhw)).removeprefix(", at ")
+        ended += f" as it was run; here {here}: to narrow it, run anew"
     if content["stopped_by"] not in ("rhw", "accept", "below_reference") and target is not None:
         rhw = content["per_hour"]["rhw"]
         ended += f"{'' if rhw is None else words.reached_words(rhw, share(rhw))} (asked: ± {share(target)})"
@@ -223,7 +226,7 @@ def deciding_words(content: Mapping[str, Any], s_per_pair: float | None = None) 
     cost = "" if s_per_pair is None else f", {duration(n * s_per_pair)}"
     settings = "".join(f" --set {key}={value}" for key, value in needed["settings"].items())
     options = f"--margin {decision['margin']:g}{settings}"
-    return f"to decide, repeat the command with {options}{where}: some {count(n)} {pairs}{cost}"
+    return f"to decide, repeat the command with {options}{where}: about {count(n)} {pairs}{cost}"
 
 
 def pair_asked(content: Mapping[str, Any]) -> Mapping[str, Any]:
@@ -266,7 +269,7 @@ def pair_lines(
         label = label if len(label) <= words.LABEL else f"{label[: words.LABEL - 2]} …"
         rows.append((f"{name} {label}", rate, ends, f"{count(of['n_crashes'])} crashes"))
     looks = f"verdict: confidence {plain(content['decision']['confidence'])} over all looks"
-    rows.append(("A / B", *ratio_words(asked), looks * (content["decision"]["verdict"] != "open")))
+    rows.append(("A / B", *ratio_words(asked), looks))
     ends = interval(asked["ci_low"], asked["ci_high"], beside=asked["difference"])
     rows.append(("A − B", number(asked["difference"]), ends, alone_words(asked)))
     families = content.get("families", {})
@@ -284,5 +287,5 @@ def pair_lines(
     pairs = f"{count(content['n_pairs'])} pairs of tests, {scenarios}"
     head = f"{pair_words(content['decision'])} · {pairs} · crashes{counted} per {unit}"
     last = [*filter(None, [deciding_words(content, s_per_pair)]), scope]
-    under = words.wrapped([*(remarks if families else remarks[: 3 - len(last)]), *last])
+    under = words.wrapped([*(remarks if families else words.few(remarks, 4 - len(last))), *last])
     return [head, *words.columns(rows), *parts, *under, f"  report  {report}"]

@@ -290,13 +290,18 @@ def lines(answer: ShortAnswer, took_s: float | None = None, report: Path | None 
     Those of more than `WIDTH` columns go on below. Where there is much to warn of the last rows give way: all of it is
     on the page.
     """
-    warnings = [f"! {text}" for text in answer.warnings]
-    if len(warnings) > MOST_WARNINGS:
-        warnings[MOST_WARNINGS - 1 :] = [f"! {count(len(warnings) - MOST_WARNINGS + 1)} more warnings: see the report"]
+    warnings = few([f"! {text}" for text in answer.warnings], MOST_WARNINGS)
     ends = [answer.scope, *([] if report is None else [f"report  {report}"])]
     rows = answer.rows[: LINES - 1 - len(warnings) - len(ends)]
     table = columns([row.texts for row in rows])
     return [headed(answer, took_s), *table, *wrapped([*warnings, ends[0]]), *(f"  {line}" for line in ends[1:])]
+
+
+def few(remarks: list[str], most: int) -> list[str]:
+    """Remarks, of which the last says how many there are on the page where they are too many."""
+    if len(remarks) <= most:
+        return remarks
+    return [*remarks[: most - 1], f"! {count(len(remarks) - most + 1)} more warnings: see the report"]
 
 
 def headed(answer: ShortAnswer, took_s: float | None) -> str:

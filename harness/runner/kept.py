@@ -27,7 +27,6 @@ from harness.campaign.campaign import Campaign
 from harness.campaign.files import dump_campaign
 from harness.errors import RunFolderError, TooManyFailedError
 from harness.estimators.block import Block
-from harness.numbers import two_digits_up
 from harness.records.folder import (
     CAMPAIGN,
     MANIFEST,
@@ -148,7 +147,6 @@ class Run:
             shown=(*self.shown, ShownTests.of(shard.tables["episodes"], self.resolved.family)),
             repeated=shard.repeated or self.repeated,
         )
-        run.require_few_failed(at_least=SMALLEST_FAILED_SAMPLE)
         n_rows = sum(table.num_rows for each in run.open for table in each.tables.values())
         if run.n_episodes - run.open[0].request.first_episode >= PART_TESTS or n_rows >= PART_ROWS:
             n = len(run.open)  # small tables cost more than their rows
@@ -203,7 +201,11 @@ class Run:
         """Refuse an answer from tests of which too many failed, once there are ``at_least`` so many."""
         if self.n_episodes >= at_least:
             failures = sum((each.causes for each in self.shown), Counter[str]())
-            require_few_failed(failures, self.n_episodes, self.resolved.campaign)
+            first = next(
+                (each.first_episode + int(each.failed.argmax()) for each in self.blocks if each.failed.any()), 0
+            )
+            again = f"`harness replay {self.folder} {first}` runs one of them again"
+            require_few_failed(failures, self.n_episodes, self.resolved.campaign, again)
 
     def require_no_fewer(self) -> None:
         """Refuse (`RunFolderError`) to throw away finished tests, which the stop rule asked for now does not keep."""
@@ -272,16 +274,24 @@ def cpu_name() -> str:
 
 
 def require_few_failed(
-    causes: Counter[str], n: int, campaign: Campaign, what: str = "tests", where: str = "the table `episodes`"
+    causes: Counter[str],
+    n: int,
+    campaign: Campaign,
+    again: str,
+    what: str = "tests",
+    where: str = "the table `episodes`",
 ) -> None:
-    """Refuse (`TooManyFailedError`) an answer where more of ``n`` tests, or ``what`` else, failed than are allowed."""
+    """Refuse (`TooManyFailedError`) an answer where more of ``n`` tests, or ``what`` else, failed than are allowed.
+
+    ``again`` is how to see one fail.
+    """
     if causes.total() > (most := campaign.run.max_failed_share) * n:
         cause = "".join(f", {n_such} of them with: {why}" for why, n_such in by_kind(causes).most_common(1))
         share = causes.total() / n
         enough = min(math.ceil(2e3 * share) / 1e3, 1.0)  # with room, as further tests fail more often by chance
         few = f"; or go on (`run`: --resume) with --set {SHARE}={enough:g}" if enough < 0.2 else ""  # [assumed]
-        looks = f"`harness av-check --tests {two_digits_up(max(3.0 / share, 48.0))}` shows it in seconds"
-        mend = f"Fix the AV ({looks}): a corrected one needs a new --out{few}."
+        few += ", where upper limits count them as crashes" if few else ""
+        mend = f"Fix the AV ({again}): a corrected one needs a new --out{few}."
         found, expected = f"{causes.total()} of {n} {what} failed{cause}", f"a share of at most {most:g}"
         if re.search(r"\b(nan|infinity|inf)\b", cause, re.IGNORECASE):
             mend = f"With nobody ahead gap_m is infinite and lead_speed_mps NaN (docs/controllers.md). {mend}"

@@ -35,7 +35,14 @@ from harness.progress import Progress
 from harness.records.folder import ESTIMATES, MILDER, SHELLS, parquet, sole_use, write_sealed
 from harness.records.reader import ShownTests
 from harness.resolved import Resolved
-from harness.runner.kept import Run, require_few_failed, require_own_folder, require_same_pool, take_over
+from harness.runner.kept import (
+    SMALLEST_FAILED_SAMPLE,
+    Run,
+    require_few_failed,
+    require_own_folder,
+    require_same_pool,
+    take_over,
+)
 from harness.runner.workers import LocalWorkers, ShardResult, Workers
 from harness.sampling import prepare
 from harness.sampling.paths import (
@@ -148,7 +155,9 @@ class Underway:
             causes += result.failures
             self.progress.advance(result.request.n_episodes)
         if name != MILDER:  # one of few that fails is told, as if it had crashed
-            require_few_failed(causes, n, self.run.resolved.campaign, what, f"the run folder's {name}/ table")
+            campaign, table = self.run.resolved.campaign, f"the run folder's {name}/ table"
+            again = f"`harness av-check VEHICLE --scenario {campaign.scenario}` drives it alone"
+            require_few_failed(causes, n, campaign, again, what, table)
         return pa.concat_tables(self.run.before[name])
 
     def drive_tests(self) -> Rule:
@@ -170,8 +179,11 @@ class Underway:
             for shard in self.crew.run(iter(requests), self.run.known):
                 with uninterrupted():
                     self.run = self.run.with_shard(shard)
+                self.run.require_few_failed(at_least=SMALLEST_FAILED_SAMPLE)
                 n_new = max(self.run.n_episodes - self.run.earlier.n_episodes, 0)
-                self.progress.advance(min(n_new, shard.request.n_episodes), crashes=int(shard.block.crash.sum()))
+                counts = {"crashes": int(shard.block.crash.sum()), "failed": int(shard.block.failed.sum())}
+                told = {name: n for name, n in counts.items() if n or name == "crashes"}
+                self.progress.advance(min(n_new, shard.request.n_episodes), **told)
                 asked = None if self.run.resolved.campaign.accept else rule.target
                 self.progress.status(rhw=rule.look.rhw, asked=asked or math.inf)
                 yield shard

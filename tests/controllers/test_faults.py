@@ -174,17 +174,22 @@ def test_too_many_failures_are_no_answer(episodes, n, share, tmp_path, capsys):
     assert "run.max_failed_share" in err
     assert f"2 of {n} tests failed, 2 of them with: step: ZeroDivisionError: no such thing" in err
     assert not (tmp_path / "run/estimates.json").exists()
+    assert f"harness replay {tmp_path / 'run'} 5" in " ".join(err.split())
+    assert main(["replay", str(tmp_path / "run"), "5"]) == EXIT_DONE
+    assert re.search(r"AV +FAILS at [\d.]+ s: step: ZeroDivisionError: no such thing", capsys.readouterr().out)
 
 
 @pytest.mark.parametrize(("n", "offered"), [(100, True), (10, False)])
 def test_to_go_on_is_offered_where_few_tests_failed(n, offered):
     with pytest.raises(TooManyFailedError) as caught:
-        require_few_failed(Counter({"step: raises": 5}), n, Campaign(name="x"))
+        require_few_failed(Counter({"step: raises": 5}), n, Campaign(name="x"), "`harness replay r 7`")
     assert ("--set run.max_failed_share=0.1" in caught.value.mend) == offered
-    assert f"av-check --tests {60 if offered else 48}`" in caught.value.mend
+    assert "Fix the AV (`harness replay r 7`)" in caught.value.mend
     assert "needs a new --out" in caught.value.mend
     with pytest.raises(TooManyFailedError) as caught:
-        require_few_failed(Counter({"step: returned nan, expected a finite acceleration": 5}), n, Campaign(name="x"))
+        require_few_failed(
+            Counter({"step: returned nan, expected a finite acceleration": 5}), n, Campaign(name="x"), ""
+        )
     assert caught.value.mend.startswith("With nobody ahead gap_m is infinite and lead_speed_mps NaN")
 
 

@@ -200,8 +200,8 @@ def test_the_sum_warns_of_what_a_scenario_alone_would(tmp_path):
         assert of["n_failed"] == best["details"]["n_failed"] > 0
         worst = scale * best["details"]["crash_rate_if_failed_had_crashed"]
         assert of["if_failed_had_crashed"] == pytest.approx(worst, rel=1e-12)
-        failed = f"{of['n_failed']} of {of['n_episodes']} tests FAILED; had they all crashed, as upper limits assume,"
-        assert f"! {words}: {failed} {number(worst)} per hour" in told
+        failed = f"{of['n_failed']} of {of['n_episodes']} tests FAILED; had they all crashed, as upper limits assume"
+        assert f"! {words}: {failed}, the rate would be {number(worst)} per hour" in told
         assert f"! {words}: NOT REPRODUCIBLE: " in told
     assert "! lead brakes: " in told.partition("tests crashed BEFORE the event")[0]
     again = harness.estimate_families(run.folder)

@@ -12,7 +12,7 @@ from harness.numbers import number, plain
 from harness.records.folder import read_manifest
 from harness.report.rows import decided, held_back
 from harness.report.summary import read_run_folder
-from harness.report.words import LINES, WIDTH, columns, lines, short_answer
+from harness.report.words import LINES, WIDTH, columns, few, lines, short_answer
 from harness.runner.stored import stored_blocks
 from tests.stored_runs import answer_in, estimates, golden
 
@@ -198,3 +198,8 @@ def test_a_decision_without_an_upper_end_is_written_and_told(low, told):
     found = Decision(0.5, "assumption_free", 0.95, low, math.inf, 40, "r157-cc").to_json()
     assert (found["verdict"], found["high"], held_back(found)) == ("undecided", None, False)
     assert decided(found).remark == told
+
+
+def test_of_too_many_remarks_the_last_says_where_they_are():
+    assert few(["a", "b", "c"], 3) == ["a", "b", "c"]
+    assert few(["a", "b", "c"], 2) == ["a", "! 2 more warnings: see the report"]

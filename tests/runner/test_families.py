@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import html
 import json
+import re
 import shutil
 from pathlib import Path
 
@@ -153,7 +154,12 @@ def test_other_exposures_need_no_new_tests(run, capsys):
     assert main(["estimate", str(run.folder), "--exposure", "lead_brakes=0.3"]) == 0
     said = capsys.readouterr()
     assert "given: lead brakes 0.3" in said.out
+    assert said.out.rstrip().endswith("stopped: precise enough")
     assert not said.err
+    assert main(["estimate", str(run.folder), "--confidence", "0.999"]) == 0
+    assert re.search(
+        r"precise enough as it was run; here (at over )?± \d+ %", " ".join(capsys.readouterr().out.split())
+    )
     assert main(["estimate", str(run.folder), "--exposure", "cut_out=1"]) == 0  # of all, not of those in scope
     assert "note: exposure cut_out=1 is 245 times the shipped one" in capsys.readouterr().err
     again = estimate_families(run.folder, {})
