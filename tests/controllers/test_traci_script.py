@@ -142,7 +142,7 @@ AT_THE_DOOR = {
     r"Take out, or replace, vehicle.moveTo \(line 7\), edge.getIDList \(line 9\): docs": text(
         "traci.vehicle.setSpeed('ego', 9.0); traci.vehicle.moveTo('ego', 'e0_0', 1.0)\n\n    traci.edge.getIDList()"
     ),
-    r"my.py:7\).*Fix the script in that line. Take out, or replace, edge.getIDList \(line 9\).*that it reads itself must": text(
+    r"my.py:7\).*Fix the script in that line. Take out.*edge.getIDList \(line 9\).*it reads itself": text(
         "traci.vehicle.setSpeed('ego', 9.0); open('a.net.xml')\n\n    traci.edge.getIDList()"
     ),
     "'truck' is not known, or not seen yet: there are LV, BV, ego": text(
