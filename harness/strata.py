@@ -83,7 +83,8 @@ class ShellDesign:
     stratum; empty if that is no limit.
 
     With ``shadow_runs`` the paths are the few that the vehicle has walked itself, chosen from so many ``candidates``
-    (else 0).
+    (else 0). Events on the road are counted ahead of drivers who do not provoke them: ``p_held``, with its standard
+    error ``p_held_se``, is the probability of one ahead of an AV that holds its speed, where that is not ``p_event``.
     """
 
     pool: str
@@ -104,6 +105,8 @@ class ShellDesign:
     available: tuple[int, ...] = ()
     shadow_runs: bool = False
     candidates: int = 0
+    p_held: float | None = None
+    p_held_se: float = 0.0
 
     @cached_property
     def p(self) -> FloatArray:
@@ -111,9 +114,14 @@ class ShellDesign:
         return np.asarray(np.bincount(self.cell_stratum, self.cell_p, minlength=len(self.strata)), np.float64)
 
     @property
+    def p_counted(self) -> float:
+        """Probability of an event as events per hour are counted."""
+        return self.p_event if self.p_held is None else self.p_held
+
+    @property
     def p_event_error(self) -> float:
-        """Relative standard error of ``p_event``."""
-        return self.p_event_se / self.p_event
+        """Relative standard error of ``p_counted``."""
+        return (self.p_event_se if self.p_held is None else self.p_held_se) / self.p_counted
 
     def n_within(self, statement: str) -> int:
         """Strata that are asked about: those inside the boundary, or all."""

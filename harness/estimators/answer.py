@@ -120,7 +120,7 @@ def estimate_blocks(
     level of the intervals, by default the campaign's.
     """
     confidence, own = confidence or campaign.stop.confidence, headline_of(campaign)
-    done = one_pass(blocks, estimators or ESTIMATORS, own, confidence)
+    done = one_pass(blocks, estimators or ESTIMATORS, own, confidence, manifest.get("onset_step"))
     best = done.headline_estimate
     level, distance_m = campaign.environment.lane_change_level, manifest.get("distance_per_test_m")
     distance_km = None if distance_m is None else distance_m / 1000.0

@@ -123,10 +123,10 @@ class Block:
         """Which episodes failed, shape (n,)."""
         return np.asarray(self.outcome == FAILED)
 
-    @property
-    def n_crashes_before_event(self) -> int:
-        """How many episodes ended in a crash before their event."""
-        return int(np.count_nonzero(self.crash & ~self.happened))
+    def n_crashes_before_event(self, onset: int | None) -> int:
+        """How many episodes ended in a crash before their event, where it is known before its ``onset`` (steps)."""
+        early = True if onset is None else self.n_steps <= onset
+        return int(np.count_nonzero(self.crash & ~self.happened & early))
 
     def acts(self) -> dict[str, int]:
         """In how many episodes there was an event, and in how many the AV did each of `ACTS`."""

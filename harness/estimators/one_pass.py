@@ -98,12 +98,12 @@ class OwnState(Nade):
 
 
 class Diagnostics:
-    """Running moments of weights and ratios; add blocks, ask for the result."""
+    """Running moments of weights and ratios; add blocks, ask for the result. No event begins before ``onset``."""
 
     _drawn: SamplingPlan  # of the last block
 
-    def __init__(self) -> None:
-        self.n, self.counts = 0, Counter[str]()
+    def __init__(self, onset: int | None = None) -> None:
+        self.n, self.counts, self._onset = 0, Counter[str](), onset
         self._weight, self._event, self._contact = Moments(), Moments(), Moments()
         self._ratios = defaultdict[int, Moments](Moments)
 
@@ -114,7 +114,7 @@ class Diagnostics:
         self.n += len(block)
         counted = {"n_bv_lv_contacts": contact, "n_failed": block.failed}
         self.counts.update(block.acts(), **{name: int(np.count_nonzero(rows)) for name, rows in counted.items()})
-        if n_early := block.n_crashes_before_event:
+        if n_early := block.n_crashes_before_event(self._onset):
             self.counts["n_crashes_before_event"] += n_early
         self._weight += Moments.of(weights)
         self._event += Moments.of(weights[block.happened])
@@ -235,12 +235,16 @@ def even(blocks: Iterable[Block]) -> Iterator[Block]:
 
 
 def one_pass(
-    blocks: Iterable[Block], names: Collection[Asked] = ESTIMATORS, best: Asked | None = None, confidence: float = 0.9
+    blocks: Iterable[Block],
+    names: Collection[Asked] = ESTIMATORS,
+    best: Asked | None = None,
+    confidence: float = 0.9,
+    onset: int | None = None,
 ) -> PassResult:
     """Feed every block to every estimator that can use it; the ``best``, the headline, is by default the method's own.
 
     Blocks are contiguous and in index order, from episode 0; a gap, or no episode at all, is a `ValueError`. Too few
-    tests for the headline are a `CampaignError`.
+    tests for the headline are a `CampaignError`. ``onset`` is the step before which no event begins, if known.
     """
     blocks = iter(blocks)
     if (first := next(blocks, None)) is None:
@@ -251,7 +255,7 @@ def one_pass(
     states = {name: accumulator(asked[name]) for name, why in refusals.items() if why is None}
     empty = partial(accumulator, best)
     impacts = Impacts(empty, first.drawn.counts_above_mps) if "impact_mps" in first.columns else None
-    diagnostics, convergence, n = Diagnostics(), list[Point](), 0
+    diagnostics, convergence, n = Diagnostics(onset), list[Point](), 0
     for block in chain((first,), blocks):
         if block.first_episode != n:
             raise ValueError(f"expected a block from episode {n} on, got one from {block.first_episode}")

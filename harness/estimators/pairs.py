@@ -41,7 +41,7 @@ def _kinds(worse: float) -> IntArray:
 
 @dataclass(frozen=True)
 class PairDecision:
-    """Whether B's rate is at most 1 + ``margin`` times A's: at no margin, who crashes less often.
+    """Whether B's rate is at most 1 + ``margin`` times A's: without a margin, who crashes less often.
 
     It holds with ``confidence``, whenever it was looked for; ``given_the_library`` it is about what lies inside.
     ``ratio`` are the ends of B/A by which a margin was decided, None without one.
@@ -49,7 +49,7 @@ class PairDecision:
     of either were not the same when they ran twice. Where A has such tests, they are ``n_milder_a``.
     """
 
-    margin: float
+    margin: float | None
     verdict: PairVerdict
     confidence: float
     given_the_library: bool
@@ -60,11 +60,12 @@ class PairDecision:
 
     def to_json(self) -> dict[str, Any]:
         """What there is of it."""
-        return {name: value for name, value in asdict(self).items() if value is not None}
+        return {name: value for name, value in asdict(self).items() if value is not None or name == "margin"}
 
     def doubted(self, of_a: int, of_b: int, n_differing: int) -> PairDecision:
         """The same after what was seen of A and B besides the crashes that count."""
-        verdict = "open" if self.margin and self.verdict == "proven" and (of_b or n_differing) else self.verdict
+        held = self.margin is not None and self.verdict == "proven" and (of_b or n_differing)
+        verdict = "open" if held else self.verdict
         return replace(self, verdict=verdict, n_milder=of_b, n_milder_a=of_a or None, n_differing=n_differing)
 
 

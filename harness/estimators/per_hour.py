@@ -43,7 +43,7 @@ class OfFamily(NamedTuple):
     @property
     def per_hour(self) -> float:
         """Tests that an hour of driving stands for."""
-        return self.exposure.per_hour / self.seen.design.p_event
+        return self.exposure.per_hour / self.seen.design.p_counted
 
     @property
     def p(self) -> FloatArray:
@@ -232,6 +232,14 @@ class PerHour:
             ratios.append(mine / theirs)
         return min(ratios), max(ratios)
 
+    def limits_over_assumed(self, level: Level, *, ratio: bool) -> tuple[float, float]:
+        """The outermost limits of the rate, or of `ratio`, over both ends of each assumed exposure."""
+        exposures = {of.family: of.exposure for of in self.families}
+        ends = ({of.per_hour} if of.counted else {of.low, of.high} for of in exposures.values())
+        others = (self.with_exposures(dict(zip(exposures, each, strict=True))) for each in product(*ends))
+        limits = [of.ratio(level)[1:] if ratio else of.limits(level)[1:3] for of in others]
+        return min(low for low, _ in limits), max(high for _, high in limits)
+
     def with_exposures(self, exposures: Mapping[str, float]) -> PerHour:
         """The same tests with other exposures (events per hour), by family."""
         return PerHour(
@@ -276,7 +284,7 @@ class PerHour:
             limits, (n, n_crashes, n_failed) = of.limits(level), of.tally.totals
             ratio, low, high = PerHour([of]).ratio(level)
             yield {
-                "exposure": {**of.exposure._asdict()}, "p_event": of.seen.design.p_event,
+                "exposure": {**of.exposure._asdict()}, "p_event": of.seen.design.p_counted,
                 "n_episodes": n, "n_crashes": n_crashes, "n_failed": n_failed,
                 "rate_per_hour": limits.rate, "ci_low": limits.low, "ci_high": limits.high,
                 "upper_bound": of.limits(Level.of_bound(confidence, n)).high,

@@ -27,6 +27,7 @@ from harness.estimators.likelihood import Level
 from harness.estimators.pairs import PairDecision, Pairs, PairVerdict
 from harness.estimators.per_hour import PerHour
 from harness.estimators.shells import SeenShells
+from harness.numbers import two_digits_up
 from harness.strata import ASSUMPTION_FREE
 
 LOOK_RATIO = 1.1
@@ -73,7 +74,9 @@ class Decision:
     which the rate lies after ``n_episodes`` tests. Even where the limit is the rate itself, at most 1 - ``confidence``
     of campaigns take the wrong side, whatever the budget.
     With ``n_milder`` crashes on events too mild to count, or before events, or events that the vehicle itself made
-    milder, nothing is accepted; nor with ``n_differing`` tests that were not the same when they ran twice.
+    milder, nothing is accepted; nor with ``n_differing`` tests that were not the same when they ran twice; nor where it
+    takes ``n_runs`` baseline runs (0: there are enough) to see what the vehicle does in one of many drives.
+    ``over_assumed`` are the outermost ``low`` and ``high`` over assumed exposures, of a decision about a sum.
     """
 
     limit: float
@@ -85,13 +88,15 @@ class Decision:
     driver: str | None = None
     n_milder: int = 0
     n_differing: int = 0
+    n_runs: int = 0
+    over_assumed: tuple[float, float] | None = None
 
     @property
     def verdict(self) -> Verdict:
         """On which side of the limit the interval lies, if that can be said."""
         if self.low > self.limit:
             return "rejected"
-        doubted = self.n_milder or self.n_differing
+        doubted = self.n_milder or self.n_differing or self.n_runs
         return "accepted" if self.high < self.limit and not doubted else "undecided"
 
     def to_json(self) -> dict[str, Any]:
@@ -274,8 +279,26 @@ class RoundRule(Rule):
             found = self._beside(seen, limit, driver)
             rhw = seen.limits(Level.two_sided(self._confidence), self._statement).rhw
             ended: Ended | None = None if found.verdict == "undecided" else "accept"
+            if found.verdict == "accepted":
+                found = replace(found, n_runs=self._runs_needed(seen, found))
+            if ended and isinstance(seen, PerHour):
+                level = self.level_at(seen.expected(limit, driver, self._statement), self._confidence)
+                over = seen.limits_over_assumed(level, ratio=driver is not None)
+                found = replace(found, over_assumed=over)
             self.look = Look(rhw, ended, (note("accept", asked=key, limit=limit),), decision=found)
         return self.look.stopped
+
+    def _runs_needed(self, seen: SeenShells | PerHour, found: Decision) -> int:
+        """Baseline runs to see what would break the limit if it crashed on all events; 0 where there are enough.
+
+        However many tests there are, they repeat these runs: what a vehicle that acts before the event does in a share
+        of drives below 1 - (1 - confidence)^(1/n), none of n runs may show.
+        """
+        designs = [of.seen.design for of in seen.families] if isinstance(seen, PerHour) else [seen.design]
+        runs = min((each.n_independent for each in designs if each.shadow_runs), default=math.inf)
+        unseen = -math.expm1(math.log1p(-found.confidence) / runs)
+        times = unseen * found.n_episodes / seen.expected(found.limit, found.driver, ASSUMPTION_FREE)
+        return two_digits_up(runs * times) if times > 1.0 else 0
 
 
 class PairRule(Rule):
@@ -296,13 +319,13 @@ class PairRule(Rule):
         self._below_reference = stop.below_reference if margin is None and rhw is None else None
         self._asked = note("sign") if margin is None else note("margin", margin=margin)
         self.conditional = self._statement != ASSUMPTION_FREE
-        self.decision = PairDecision(margin or 0.0, "open", (1.0 + stop.confidence) / 2.0, self.conditional)
+        self.decision = PairDecision(margin, "open", (1.0 + stop.confidence) / 2.0, self.conditional)
 
     def observe(self, pairs: Pairs) -> bool:
         """Whether to stop at the end of a round."""
         watched, level = pairs.within(self._statement), Level.two_sided(self._confidence)
         self.decision = replace(self.decision, verdict=self._verdict(watched))
-        if self.decision.margin and watched.n_crashes:
+        if self.decision.margin is not None and watched.n_crashes:
             _, low, high = watched.ratio(self._level(watched))
             self.decision = replace(self.decision, ratio=(1.0 / high, 1.0 / low if low > 0.0 else math.inf))
         pool = watched.rhw_from_pool(level)
@@ -333,7 +356,7 @@ class PairRule(Rule):
         return Level.two_sided(self._confidence)
 
     def _verdict(self, watched: Pairs) -> PairVerdict:
-        return watched.verdict(self.decision.margin, self._level(watched))
+        return watched.verdict(self.decision.margin or 0.0, self._level(watched))
 
     def _both_below(self, watched: Pairs) -> bool:
         """Whether both are known to crash less than so many times as often as the reference driver does at least."""

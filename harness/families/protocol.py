@@ -288,6 +288,10 @@ class Family(Protocol):
         """Steps (m,) at whose end chosen events begin, -1 for none; what happens in them may be later."""
         return np.where(chosen.at < 0, -1, np.maximum(chosen.at - chosen.lead, 0))
 
+    def first_onset(self, traffic: Environment) -> int | None:
+        """Step at whose end the earliest event begins, where it follows from the traffic alone; else None."""
+        return None
+
     def told(self, facts: Mapping[str, Any]) -> str:
         """What an event is like, by the columns of its test, as a phrase behind that of its onset; may be empty."""
         return ""

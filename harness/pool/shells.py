@@ -89,11 +89,11 @@ class Pool:
 
     ``key`` is the hash of all that it was made from, ``family`` names the kind of its events, ``environment`` is the
     hash of its environment. ``names`` (D) are the surrogates, the most conservative first, ``mu`` (D,) their crash
-    rates per test from ``n_paths`` paths, and ``mu_covariance`` (D, D) of their errors. ``p_event``, ``p_event_se``,
-    ``reference_rate`` and ``reference_square`` (R,) see `ShellDesign`. Cells divide shells by which references crash:
-    ``cell_shell``, ``cell_references`` (C,) are the shell of each and one bit per reference, ``cell_p`` (C,) its
-    probability. ``p_after_failure`` is the probability, at most, of events after a baseline run has failed: nothing is
-    known about them.
+    rates per test from ``n_paths`` paths, and ``mu_covariance`` (D, D) of their errors. ``p_event``, ``p_held`` and
+    their standard errors, ``reference_rate`` and ``reference_square`` (R,) see `ShellDesign`. Cells divide shells by
+    which references crash: ``cell_shell``, ``cell_references`` (C,) are the shell of each and one bit per reference,
+    ``cell_p`` (C,) its probability. ``p_after_failure`` is the probability, at most, of events after a baseline run has
+    failed: nothing is known about them.
     """
 
     key: str
@@ -113,6 +113,8 @@ class Pool:
     reference_square: FloatArray
     events: KeptEvents
     p_after_failure: float = 0.0
+    p_held: float = math.nan
+    p_held_se: float = 0.0
 
     @cached_property
     def shell_p(self) -> FloatArray:
@@ -253,6 +255,8 @@ def design_shells(pool: Pool, limit_mps2: float) -> ShellDesign:
         n_inside=sum(group[-1] <= boundary_shell(pool) for group in groups),
         p_event=pool.p_event,
         p_event_se=pool.p_event_se,
+        p_held=None if math.isnan(pool.p_held) else pool.p_held,
+        p_held_se=pool.p_held_se,
         p_unreachable=pool.p_event - float(p.sum()),
         shadow_runs=(acts := pool.events.acts),
         candidates=CANDIDATES if acts else 0,

@@ -45,6 +45,7 @@ class BaselinePaths:
     ``key`` is the content hash of all that they follow from, ``seed`` that of their random numbers. ``order`` (D,) are
     the surrogates as places in the library, the most conservative behind an AV that holds its speed first. ``index``,
     ``start``, ``weight`` (n,) are the paths' numbers, how they begin, and naturalistic density over that of the draw.
+    ``p_held`` (2,) is the probability of an event ahead of an AV that holds its speed, and its standard error.
     """
 
     key: str
@@ -53,6 +54,7 @@ class BaselinePaths:
     index: IntArray
     start: RecordArray
     weight: FloatArray
+    p_held: FloatArray
 
     @property
     def paths(self) -> Paths:
@@ -74,8 +76,8 @@ class Candidates(BaselinePaths):
         u = uniforms(self.seed, 0, n, DIAGNOSTIC, CHOICE_DRAW + 1)[:, CHOICE_DRAW]
         cumulative = np.cumsum(self.chance)
         chosen = np.minimum(np.searchsorted(cumulative, u * cumulative[-1], side="right"), len(self) - 1)
-        arrays = (values[chosen] for values in (self.index, self.start, self.weight))
-        return BaselinePaths(self.key, self.seed, self.order, *arrays)
+        of_each = self.index[chosen], self.start[chosen], self.weight[chosen]
+        return BaselinePaths(self.key, self.seed, self.order, *of_each, self.p_held)
 
 
 def walk_candidates(resolved: Resolved, key: str, progress: Progress, candidates: int = CANDIDATES) -> Candidates:
@@ -89,7 +91,9 @@ def walk_candidates(resolved: Resolved, key: str, progress: Progress, candidates
     index, start, weight, rates = (np.concatenate(column) for column in zip(*columns, strict=True))
     chance = chances(rates, aim.share)
     order = conservative_first(rates)
-    return Candidates(key, aim.enumerator.seed, order, index, start, weight / (candidates * chance), chance)
+    event = rates[:, -1]
+    p_held = np.array([event.mean(), event.std() / np.sqrt(candidates)])
+    return Candidates(key, aim.enumerator.seed, order, index, start, weight / (candidates * chance), p_held, chance)
 
 
 def chances(rates: FloatArray, share: FloatArray) -> FloatArray:
@@ -117,7 +121,7 @@ def campaign_baseline_paths(resolved: Resolved, progress: Progress) -> BaselineP
     key, name = _candidates_key(resolved), baseline_paths_name(resolved)
     if (content := cache.read(name)) is not None:
         with np.load(BytesIO(content)) as stored:
-            columns = {name: stored[name] for name in ("order", "index", "start", "weight", "chance")}
+            columns = {name: stored[name] for name in ("order", "index", "start", "weight", "p_held", "chance")}
             candidates = Candidates(key, int(stored["seed"]), **columns)
     else:
         candidates = walk_candidates(resolved, key, progress)
@@ -150,4 +154,5 @@ def vehicle_pool(resolved: Resolved, paths: BaselinePaths, runs: Recorded) -> Po
     # A kept event stands for its like nearby, too, where these are too improbable to be kept one by one.
     least = pool.shell_p[pool.shell] * (len(paths) / np.bincount(pool.shell)[pool.shell])
     events = replace(pool.events, motion=hashes[row, onset], mass=np.maximum(mass[row, step], least))
-    return replace(pool, events=events, p_after_failure=float((found.after_failure * paths.weight).mean()))
+    p_after_failure, (p_held, p_held_se) = float((found.after_failure * paths.weight).mean()), paths.p_held.tolist()
+    return replace(pool, events=events, p_after_failure=p_after_failure, p_held=p_held, p_held_se=p_held_se)

@@ -54,7 +54,7 @@ def statement_case(content: dict[str, Any], message: str, asked: str, exit_code:
 def difference_case(content: dict[str, Any], message: str, exit_code: int) -> Case:
     """Case of ``compare.json``, which the ``message`` tells: that B is not worse by more than the margin, if any."""
     decision = content["decision"]
-    name = pair_words({**decision, "verdict": "proven"}) if decision["margin"] else "difference"
+    name = pair_words({**decision, "verdict": "proven"}) if decision["margin"] is not None else "difference"
     return Case(name, message, OUTCOMES.get(exit_code, "failure"), verdict=pair_words(decision))
 
 

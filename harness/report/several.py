@@ -15,7 +15,7 @@ from harness.families.words import EXCLUDED
 from harness.numbers import count, duration, interval, number, plain, ratio, share, tenths, two_digits_up
 from harness.report import words
 from harness.report.notes import note_words
-from harness.report.rows import Row, decided, looking_words, ratio_texts
+from harness.report.rows import Row, decided, end, looking_words, ratio_texts
 from harness.report.words import ShortAnswer
 from harness.strata import LIBRARY_STATEMENT
 
@@ -107,9 +107,14 @@ def family_rows(content: Mapping[str, Any]) -> Iterator[tuple[str, ...]]:
 def sum_warnings(content: Mapping[str, Any]) -> Iterator[str]:
     """What changes the meaning of the rows, a line each, by scenario."""
     decision, ends = content.get("decision"), content["beside"]["over_assumed"]
-    asked = decision["limit"] if decision and decision["driver"] and decision["verdict"] != "undecided" else math.nan
-    if ends is not None and ends[0] <= asked <= ends[1]:
-        yield f"assumed numbers may turn this verdict: × {ratio(ends[0])} to {ratio(ends[1])} over their ranges"
+    if decision and (verdict := decision["verdict"]) != "undecided":
+        limit, over = decision["limit"], decision.get("over_assumed")
+        turned = over is not None and (end(over[1]) >= limit if verdict == "accepted" else over[0] <= limit)
+        if turned or (ends is not None and decision["driver"] and ends[0] <= limit <= ends[1]):
+            low, high = over if turned else ends
+            most = "no limit" if high is None else ratio(high)
+            yield f"assumed numbers may turn this verdict: × {ratio(low)} to {most} over their ranges"
+    yield from words.runs_warning(decision)
     for each in content["readings"]:
         if _side(each) != _side(content["beside"]):
             yield f"beside {each['reference']}, another reading of UN R157, it is × {' ('.join(ratio_words(each))})"
@@ -174,7 +179,9 @@ def pair_words(decision: Mapping[str, Any]) -> str:
     margin, verdict = decision["margin"], decision["verdict"]
     if not margin:
         told = {"proven": "B crashes less often than A", "refuted": "B crashes more often than A"}
-        of_safer = {"proven": decision.get("n_milder"), "refuted": decision.get("n_milder_a")}.get(verdict)
+        of_b, of_a = decision.get("n_milder"), decision.get("n_milder_a")
+        held = margin is not None and (of_b or decision.get("n_differing"))
+        of_safer = {"proven": of_b, "refuted": of_a, "open": held}[verdict]
         return told.get(verdict, "Not told apart") + ", see !" * bool(of_safer)
     most = share(margin)
     # Of B / A; told as all else, of A / B.
@@ -213,7 +220,8 @@ def deciding_words(content: Mapping[str, Any], s_per_pair: float | None = None) 
     decision = content["decision"]
     if decision["verdict"] != "open" or content.get("ended") == "sum":
         return None
-    if decision["margin"] and (decision["n_milder"] or decision["n_differing"]):  # which no more pairs would mend
+    doubted = decision["n_milder"] or decision["n_differing"]
+    if decision["margin"] is not None and doubted:  # which no more pairs would mend
         return None
     if not content["n_only_a"] + content["n_only_b"]:
         return "in no pair of tests did they differ"
@@ -225,7 +233,7 @@ def deciding_words(content: Mapping[str, Any], s_per_pair: float | None = None) 
     n = two_digits_up(needed["pairs"] - done)
     cost = "" if s_per_pair is None else f", {duration(n * s_per_pair)}"
     settings = "".join(f" --set {key}={value}" for key, value in needed["settings"].items())
-    options = f"--margin {decision['margin']:g}{settings}"
+    options = f"--margin {decision['margin'] or 0.0:g}{settings}"
     return f"to decide, repeat the command with {options}{where}: about {count(n)} {pairs}{cost}"
 
 

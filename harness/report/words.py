@@ -6,6 +6,7 @@ rows are in `harness.report.rows`.
 
 from __future__ import annotations
 
+import math
 import textwrap
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -125,8 +126,19 @@ def doubts_of(campaign: Campaign, manifest: Mapping[str, Any], told: Estimates, 
         "cut_off": times * told.cut_off, "cut_off_test": told.cut_off_test,
         "cautions": best.cautions, "repeated": manifest.get("repeated"), "failure": manifest.get("failure"),
         "share_below_1_mps": None if severity is None else severity.share_below_1_mps,
+        "missed": _missed(manifest, told, times),
         "assumed": told.assumed, "before_event": before_event(campaign, manifest, told.diagnostics),
     }  # fmt: skip
+
+
+def _missed(manifest: Mapping[str, Any], told: Estimates, times: float) -> dict[str, Any] | None:
+    """What a vehicle may do so rarely that no baseline run shows it, if it then crashes on all events."""
+    runs, shells = manifest.get("shadow_runs"), told.best.details.get("shells")
+    if not runs or not shells:
+        return None
+    share_unseen = -math.expm1(math.log1p(-told.confidence) / runs["n_runs"])
+    rate = times * share_unseen * math.fsum(each["p"] for each in shells)
+    return {"n_runs": runs["n_runs"], "drives": round(1.0 / share_unseen), "rate": rate}
 
 
 def warnings_of(scenario: str, of: Mapping[str, Any], unit: str, but: str = "") -> Iterator[str]:
@@ -151,6 +163,9 @@ def warnings_of(scenario: str, of: Mapping[str, Any], unit: str, but: str = "") 
     if n := len(repeated.get("differing", ())):
         again = count(repeated["n_episodes"])
         yield f"NOT REPRODUCIBLE: {count(n)} of {again} tests that ran twice differed: see `harness av-check`"
+    if (missed := of.get("missed")) and missed["rate"] > of["ci_high"]:
+        what = f"crashes there, up to {number(missed['rate'])}{unit}, are in no limit (pool.shadow_paths)"
+        yield f"{count(missed['n_runs'])} baseline runs may miss what it does in 1 of {missed['drives']} drives: {what}"
     if n := of["n_failed"]:
         failed, had = f"{count(n)} of {count(of['n_episodes'])}", f"{number(of['if_failed_had_crashed'])}{unit}"
         why = f"; most with: {of['failure']}" if of.get("failure") else ""
@@ -174,6 +189,7 @@ def _warnings(campaign: Campaign, manifest: Mapping[str, Any], told: Estimates) 
     yield from warnings_of(campaign.scenario, of | doubts_of(campaign, manifest, told), " per test", but)
     if assumed is not None and assumed.where and assumed.times is None:
         yield unseen_words(assumed.where)
+    yield from runs_warning(told.decision)
     on_rate = told.decision is not None and not told.decision.get("driver")
     if on_rate and assumed is not None and assumed.no_lower_limit:
         yield f"no lane change was seen at {assumed.where}: a limit on the rate rests on that; use --accept r157-cc"
@@ -181,6 +197,13 @@ def _warnings(campaign: Campaign, manifest: Mapping[str, Any], told: Estimates) 
         yield f"lane_change_level is {plain(level)}: compare only with rates at the same level"
     if traffic is not None:
         yield from too_few(traffic.n_replicates, traffic.confidence)
+
+
+def runs_warning(decision: Mapping[str, Any] | None) -> Iterator[str]:
+    """That baseline runs are too few for a verdict."""
+    if decision is not None and (n := decision.get("n_runs")):
+        more = f"raise pool.shadow_paths to {count(n)}, with a new --out"
+        yield f"its baseline runs may miss what it does in one of many drives, which may be above the limit: {more}"
 
 
 NEVER_BRAKED = f"it never braked with {plain(BRAKED_MPS2)} m/s² or more: does it see the other vehicle?"

@@ -63,7 +63,7 @@ class PairedScenario:
     @property
     def tests_per_hour(self) -> float:
         """Tests that an hour of driving stands for."""
-        return self.exposure.per_hour / self.runs[0].prescribed.design.p_event
+        return self.exposure.per_hour / self.runs[0].prescribed.design.p_counted
 
     def take_over(self, rule: PairRule) -> None:
         """Take what the folders hold."""

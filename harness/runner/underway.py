@@ -132,7 +132,8 @@ class Underway:
         """Drive the vehicle along paths without an event, if tests follow from some, and to a few that are too mild."""
         self.keep_design()
         resolved, source = self.run.resolved, self.run.source
-        self.run = self.run.noting(assumed=assumed(resolved, source.pool, source.design, self.progress))
+        left_open = assumed(resolved, source.pool, source.design, self.progress)
+        self.run = self.run.noting(assumed=left_open, onset_step=resolved.family.first_onset(resolved.environment))
         if resolved.family.milder(resolved.environment) is not None:
             driven = self._before(MILDER, N_MILDER)
             self.run = self.run.noting(milder=milder_of(resolved, driven))
@@ -210,7 +211,7 @@ class Underway:
         run, campaign, counts = self.run, self.run.resolved.campaign, Counter[str]()
         for each in run.blocks:
             counts.update(each.acts())
-        n_early = sum(each.n_crashes_before_event for each in run.blocks)
+        n_early = sum(each.n_crashes_before_event(run.facts.get("onset_step")) for each in run.blocks)
         n_milder = n_left_out(campaign, n_early) + beyond_scope(run.facts.get("milder"))
         n_milder += n_softened(before_event(campaign, run.facts, counts))
         return n_milder, len(run.repeated.differing) if run.repeated else 0

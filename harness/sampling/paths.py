@@ -227,13 +227,9 @@ def milder_of(resolved: Resolved, table: pa.Table) -> dict[str, Any]:
 
 
 def n_left_out(campaign: Campaign, n_before_event: int) -> int:
-    """Crashes before the event, where a vehicle that follows is tested around events alone: it needs none to crash.
-
-    Where somebody changes lanes it is not known: a vehicle may see that before the event is done.
-    """
-    family = family_named(campaign.scenario)
-    at_once = family.follows and family.crosses < 0
-    return n_before_event if at_once and campaign.testing.method != "nde" else 0
+    """Crashes before the event, where a vehicle that follows is tested around events alone: it needs none to crash."""
+    follows = family_named(campaign.scenario).follows
+    return n_before_event if follows and campaign.testing.method != "nde" else 0
 
 
 def beyond_scope(milder: Mapping[str, Any] | None) -> int:

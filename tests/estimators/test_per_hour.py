@@ -52,6 +52,27 @@ def joined(families):
     return p, *counts
 
 
+def test_limits_over_assumed_exposures_are_the_outermost():
+    found = PerHour(THREE)
+    for ratio in (False, True):
+        each = []
+        for lead_brakes in (0.02, 0.5):
+            for cut_out in (0.0004, 0.02):
+                moved = found.with_exposures({"lead_brakes": lead_brakes, "cut_out": cut_out})
+                each.append(moved.ratio(LEVEL)[1:] if ratio else moved.limits(LEVEL)[1:3])
+        outermost = min(low for low, _ in each), max(high for _, high in each)
+        assert found.limits_over_assumed(LEVEL, ratio=ratio) == pytest.approx(outermost)
+
+
+def test_of_a_vehicle_that_provokes_events_an_hour_counts_those_ahead_of_others():
+    (holds,), design = THREE[:1], THREE[0].seen.design
+    holds.seen.design = replace(design, p_event=2.0 * design.p_event, p_held=design.p_event)
+    try:
+        assert holds.per_hour == COUNTED.per_hour / design.p_event
+    finally:
+        holds.seen.design = design
+
+
 def test_the_sum_and_its_limits_are_those_of_all_strata_side_by_side():
     found, (p, crashes, tests) = PerHour(THREE).limits(LEVEL), joined(THREE)
     assert found.rate == pytest.approx(float(p @ (crashes / tests)), rel=1e-12)

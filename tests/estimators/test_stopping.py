@@ -19,6 +19,8 @@ from harness.estimators.pairs import CRASH, NO_CRASH, no_pairs
 from harness.estimators.shells import SeenShells
 from harness.estimators.stopping import LOOK_RATIO, Decision, RoundRule, StopRule, look_grid
 from harness.estimators.tally import Tally
+from harness.numbers import two_digits_up
+from harness.report.words import runs_warning
 from harness.strata import ASSUMPTION_FREE, Reference
 from tests.estimators.small_blocks import SHELLS, block
 
@@ -149,6 +151,23 @@ def test_a_run_that_a_reference_driver_ends_is_held_to_the_level_of_decisions(n)
         assert stopped[-1] == (accepting.look.decision.verdict == "accepted") == (below.look.ended == "below_reference")
     assert stopped == sorted(stopped)
     assert 0 < sum(stopped) < 40
+
+
+def test_few_baseline_runs_accept_nobody_who_may_do_it_rarely():
+    """However many tests repeat them: a share of drives that none of 500 shows may crash on all events."""
+    tests, crashes = np.full(len(DESIGN.strata), 3_000), np.zeros(len(DESIGN.strata), np.int64)
+    limit, found = 0.003 * DESIGN.p.sum(), {}
+    for n_paths in (0, 500, 1_000):
+        runs = {"shadow_runs": True, "n_paths": n_paths, "candidates": 10**9} if n_paths else {}
+        of_runs, asked = seen(tests, crashes), rule(limit)
+        of_runs.design = replace(DESIGN, **runs)
+        asked.observe(of_runs)
+        found[n_paths] = asked.look.decision
+        assert asked.look.ended == "accept"
+    share = 1.0 - 0.05 ** (1 / 500)
+    assert [each.verdict for each in found.values()] == ["accepted", "undecided", "accepted"]
+    assert found[500].n_runs == two_digits_up(500 * share / 0.003)
+    assert "baseline runs may miss" in " ".join(runs_warning(found[500].to_json()))
 
 
 def test_a_decision_stays_and_what_the_folder_holds_is_not_given_up():

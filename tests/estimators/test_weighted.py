@@ -41,6 +41,14 @@ def test_no_crash_still_gives_an_upper_bound_and_an_interval():
     assert estimate.rhw == math.inf
 
 
+def test_where_every_test_has_crashed_some_might_not_have():
+    """Equal weights show no spread: the lower limit is that of a share."""
+    estimate = nade(block([True] * 20, [math.log(0.5)] * 20, method="forced", weight_cap=0.5)).result(0.9)
+    assert (estimate.crash_rate, estimate.ci_high) == pytest.approx((0.5, 0.5))
+    assert estimate.ci_low == pytest.approx(0.5 * 0.05 ** (1 / 20))
+    assert estimate.rhw == pytest.approx(0.5 * (1.0 - 0.05 ** (1 / 20)))
+
+
 def test_the_cap_comes_from_the_design_then_from_the_paths_then_from_weights():
     some, paths = ([True, False], [-7.0, 0.0]), np.log([1e-3, 2e-3])
     known = nade(block(*some, method="forced", weight_cap=5e-3, log_p_event=paths))

@@ -138,10 +138,11 @@ def test_one_that_does_not_is_not_told_of_them(tmp_path, capsys):
     assert json.loads((out / "estimates.json").read_text())["milder"]["n_crashes"] == 0
 
 
-def test_one_that_crashes_without_an_event_is_told_so_and_not_accepted(tmp_path, capsys):
-    """Every fifth test ends in the vehicle ahead before that brakes; the rate alone is far below the limit."""
+@pytest.mark.parametrize("scenario", ["lead_brakes", "cut_out"])
+def test_one_that_crashes_without_an_event_is_told_so_and_not_accepted(scenario, tmp_path, capsys):
+    """Every fifth test ends in the vehicle ahead before that brakes or leaves; the rate is far below the limit."""
     (tmp_path / "my_av.py").write_text(AV)
-    out, _, code = gate(tmp_path, f"{tmp_path}/my_av.py:Rams", "lead_brakes")
+    out, _, code = gate(tmp_path, f"{tmp_path}/my_av.py:Rams", scenario)
     estimates = json.loads((out / "estimates.json").read_text())
     n = estimates["diagnostics"]["n_crashes_before_event"]
     assert 0 < n == -(-estimates["n_episodes"] // 5)
@@ -180,10 +181,10 @@ def test_many_events_that_it_made_milder_are_more_than_a_tenth(behind, braked, w
     assert less == ("0.50 (crashes less, see !)" if n else "0.50 (crashes less)")
 
 
-def test_where_somebody_changes_lanes_it_is_not_known_what_came_first():
-    """And plain simulation counts such crashes as they are."""
+def test_crashes_before_events_are_left_out_where_the_vehicle_follows():
+    """But not by plain simulation, which counts such crashes as they are."""
     asked = [["scenario=lead_brakes"], ["scenario=lead_brakes", "testing.method=nde"], ["scenario=cut_out"], []]
-    assert [n_left_out(harness.load_campaign("idm", each), 3) for each in asked] == [3, 0, 0, 0]
+    assert [n_left_out(harness.load_campaign("idm", each), 3) for each in asked] == [3, 0, 3, 0]
 
 
 @pytest.mark.slow

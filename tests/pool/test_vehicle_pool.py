@@ -111,6 +111,7 @@ def test_shells_of_a_holder_on_few_chosen_paths_are_those_of_the_large_pool(camp
     assert np.median(error / pool.mu) < 0.05
     assert np.all(np.abs(own.mu[order] - pool.mu) < 4.0 * error)
     assert abs(own.p_event - pool.p_event) < 4.0 * np.hypot(own.p_event_se, pool.p_event_se)
+    assert abs(own.p_held - pool.p_event) < 4.0 * np.hypot(own.p_held_se, pool.p_event_se)
 
 
 @pytest.mark.parametrize("kept", [500, 5_000])

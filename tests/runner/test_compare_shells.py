@@ -175,8 +175,9 @@ def test_a_margin_is_decided(campaigns, done, tmp_path, swapped, verdict, exit_c
         (0.1, (0, 0), (1, 0), "open"),
         (0.1, (0, 1), (0, 0), "open"),
         (0.1, (0, 0), (0, 1), "open"),
-        (0.0, (0, 0), (1, 1), "proven"),
-        (0.0, (1, 0), (1, 1), "proven"),  # who crashes less often is told, with the warnings
+        (0.0, (0, 0), (0, 1), "open"),  # a gate like any other
+        (None, (0, 0), (1, 1), "proven"),
+        (None, (1, 0), (1, 1), "proven"),  # who crashes less often is told, with the warnings
     ],
 )
 def test_no_margin_is_kept_by_a_vehicle_in_doubt(margin, of_a, of_b, verdict):
@@ -188,7 +189,9 @@ def test_no_margin_is_kept_by_a_vehicle_in_doubt(margin, of_a, of_b, verdict):
     assert deciding_words({"decision": asdict(found), "to_decide": None}) is None  # more pairs would not help
     refuted = replace(found, verdict="refuted").doubted(of_a[0], 0, 1)
     assert refuted.verdict == "refuted"
-    if not margin:  # of a safer one in doubt that is said beside it
+    if margin == 0.0:
+        assert pair_words(found.to_json()) == "Not told apart, see !"
+    if margin is None:  # of a safer one in doubt that is said beside it
         assert pair_words(found.to_json()) == "B crashes less often than A, see !"
         assert pair_words(refuted.to_json()) == "B crashes more often than A" + ", see !" * of_a[0]
 

@@ -315,6 +315,9 @@ def test_a_verdict_that_assumed_numbers_may_turn_says_so(run, times, warned):
     verdict = Decision(times * low, "assumption_free", 0.95, 0.9 * ratio, 1.1 * ratio, driver="r157-cc").to_json()
     told = " ".join(" ".join(hour_lines({**run.content, "decision": verdict})).split())
     assert told.count("! assumed numbers may turn this verdict: × ") == warned
+    accepted = {**verdict, "limit": 2.0 * high, "verdict": "accepted", "over_assumed": [low, times * 1.9 * high]}
+    told = " ".join(" ".join(hour_lines({**run.content, "decision": accepted})).split())  # by limits, not by the rate
+    assert told.count("! assumed numbers may turn this verdict: × ") == warned
     own = {**run.content, "decision": {**verdict, "verdict": "undecided"}}
     assert "may turn" not in " ".join(hour_lines(own))
 

@@ -142,6 +142,9 @@ class FollowingFamily(Family):
     def onset(self, traffic: FollowingTraffic, chosen: Chosen) -> IntArray:
         return np.where(chosen.at < 0, -1, int(traffic.numbers["onset"]))  # records keep no lead
 
+    def first_onset(self, traffic: FollowingTraffic) -> int:
+        return int(traffic.numbers["onset"])
+
     def facts_of(self, traffic: FollowingTraffic, events: RecordArray, speed_mps: FloatArray) -> dict[str, FloatArray]:
         """Facts of the family's own, of events (n,) with a vehicle ahead at a speed: here those of its grid."""
         return {each.name: events[each.name] for each in self.columns if each.name in (EVENT_DTYPE.names or ())}
