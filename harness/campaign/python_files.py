@@ -16,7 +16,7 @@ from pathlib import Path
 from sysconfig import get_path
 from types import CodeType
 
-from harness.campaign.yaml_text import read_text
+from harness.files import opened
 
 TRACI_MODULES = "traci", "libsumo", "libtraci"
 NOT_THE_USERS = str(Path(__file__).parents[1]), get_path("stdlib"), get_path("platstdlib")
@@ -34,8 +34,8 @@ def _parsed(name: str) -> ast.Module | None:
     file = Path(name)
     if file.suffix != ".py" or not file.is_file():
         return None
-    with suppress(SyntaxError):
-        return ast.parse(read_text(file))
+    with suppress(SyntaxError, ValueError), opened(file) as source:
+        return ast.parse(source.read())  # which knows of other encodings, as Python does
     return ast.Module([], [])
 
 

@@ -18,7 +18,7 @@ from harness.commands.printing import holds_tests, print_either, print_json, pri
 from harness.errors import HarnessError
 from harness.numbers import leaves, words
 from harness.processes import start_server
-from harness.vocabulary import MOST_ASKED
+from harness.vocabulary import FAMILIES, MOST_ASKED
 
 if TYPE_CHECKING:
     from harness.campaign.campaign import Campaign
@@ -56,7 +56,9 @@ def check(
         print_json(campaign.model_dump(mode="json"))
     else:
         folder = campaign_file.parent if names_a_campaign(campaign_file) else Path()
-        click.echo(dump_campaign(campaign).replace(f"{real_path(folder)}/", ""))  # it is written there, and may move
+        text, here = dump_campaign(campaign), f"{real_path(folder)}/"
+        # It is written there, and may move; a vehicle's own parameter is nobody's to resolve.
+        click.echo(text if here in repr(campaign.av.parameters) else text.replace(here, ""))
 
 
 @click.command(
@@ -252,9 +254,12 @@ def compare(
         raise HarnessError("harness compare", f"{source_a} alone", "two vehicles, or campaigns", mend)
     from harness.campaign.files import names_a_campaign
     from harness.campaign.models import parse_override
+    from harness.records.folder import read_manifest
     from harness.report.words import vehicle_words
 
     stored = source_a if source_a.is_dir() else None
+    if stored is not None and not (stored / FAMILIES).is_file():
+        read_manifest(stored)
     file_a = source_a if stored is None else stored / "campaign.yaml"
     overrides = [*options.of_scenario(scenario), *overrides]
     a = harness.load_campaign(file_a, overrides, av=av)

@@ -46,7 +46,7 @@ def prints_kept_in(folder: Path | None = None, *, chosen: bool = False) -> Itera
     finally:
         Printed.kept = before
         with suppress(OSError):  # what ends the command is told first of all
-            manifests = () if folder is None else (*folder.glob("manifest.json"), *folder.glob("*/manifest.json"))
+            manifests = () if folder is None else folder.rglob("manifest.json")
             if folder is not None and not any(each.stat().st_mtime >= began for each in manifests):
                 os.write(2, kept.text)
             elif first := kept.text.strip().partition(b"\n")[0].decode(errors="replace"):

@@ -130,6 +130,8 @@ def _compared_elsewhere(
     folder: Path, environment: str, confidence: float | None, *, write: bool, as_json: bool
 ) -> None:
     """What two vehicles' stored tests say of other traffic."""
+    if scenarios := sorted(folder.glob(f"*/{COMPARISON}")):
+        raise click.UsageError(f"--environment is for the folder of one scenario, such as {scenarios[0].parent}.")
     if write:
         raise click.UsageError("--write does not go with the folder of a comparison.")
     with progress_bar() as bar:

@@ -17,7 +17,6 @@ import sumo_data
 
 from harness.campaign.python_files import TRACI_MODULES, file_and_function
 from harness.campaign.vehicle import AutomatedVehicle
-from harness.campaign.yaml_text import read_text
 from harness.controllers.hosts import Guard, cause_of
 from harness.controllers.protocol import EpisodeStart, Neighbour, Observation
 from harness.controllers.traci_script import ScriptController, ScriptTraci, TraciScript
@@ -82,7 +81,7 @@ def script_maker(av: AutomatedVehicle, guard: Guard) -> Callable[[], ScriptContr
 def _lacking(name: str) -> Iterator[str]:
     """What a script calls of ``traci`` that there is not, or is refused; with its lines."""
     there = ScriptTraci(VehicleDomain(SPEED_MPS, VEH_ID))
-    tree = ast.parse(read_text(Path(file_and_function(name)[0])))
+    tree = ast.parse(Path(file_and_function(name)[0]).read_bytes())
     for each in (node for node in ast.walk(tree) if isinstance(node, ast.Attribute)):
         module, *path = ast.unparse(each).split(".")
         if module in TRACI_MODULES and len(path) == 2:

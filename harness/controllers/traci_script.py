@@ -60,7 +60,7 @@ class _Simulation(SimulationDomain):
         self.arrived: tuple[str, ...] = ()
         self._subscribed: tuple[int, ...] = ()
 
-    def subscribe(self, varIDs: Sequence[int] = (0x74,), *_when: float) -> None:
+    def subscribe(self, varIDs: Sequence[int] = (0x74,), *_when: Any, **_how: Any) -> None:
         """Ask for variables, for the whole test; by default who departs."""
         self._subscribed = known_variables(varIDs, _OF_SIMULATION, "the simulation")
 

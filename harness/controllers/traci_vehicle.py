@@ -173,12 +173,12 @@ class VehicleDomain(Domain):
         """Their number."""
         return len(self._seen)
 
-    def subscribe(self, objectID: str, varIDs: Sequence[int] | None = None, *_when: float) -> None:
+    def subscribe(self, objectID: str, varIDs: Sequence[int] | None = None, *_when: Any, **_how: Any) -> None:
         """Ask for variables (numbers of ``traci.constants``), for the whole test; by default road and position."""
         self._of(objectID)
         self._subscribed[objectID] = known_variables(varIDs, _VARIABLES, "vehicles")
 
-    def subscribeLeader(self, vehID: str, *_when: float) -> None:
+    def subscribeLeader(self, vehID: str, *_when: Any, **_how: Any) -> None:
         """Ask for the vehicle ahead, beside what has been asked for."""
         self._of(vehID)
         self._subscribed[vehID] = *self._subscribed.get(vehID, ()), _LEADER
@@ -199,7 +199,7 @@ class VehicleDomain(Domain):
         return {name: self.getSubscriptionResults(name) for name in self._subscribed}
 
     def subscribeContext(
-        self, objectID: str, domain: int, dist: float, varIDs: Sequence[int] | None = None, *_when: float
+        self, objectID: str, domain: int, dist: float, varIDs: Sequence[int] | None = None, *_when: Any, **_how: Any
     ) -> None:
         """Ask for variables of the vehicles (``domain`` 0xa4) within a distance (m) of one, itself included."""
         self._of(objectID)

@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from collections import Counter, defaultdict
 from collections.abc import Callable, Collection, Iterable, Iterator
+from contextlib import suppress
 from copy import deepcopy
 from dataclasses import dataclass, replace
 from functools import partial
@@ -82,11 +83,13 @@ class OwnState(Nade):
         """Its own estimate, or one with a normal interval, our cautions and our upper bound."""
         found = self._call(self._own.result, confidence)
         if not isinstance(found, Estimate):
-            rate, std_error = found if isinstance(found, tuple) and len(found) == 2 else (np.nan, np.nan)
-            if not (np.isfinite(rate) and std_error >= 0.0):
+            rate = std_error = math.nan
+            with suppress(TypeError, ValueError):
+                rate, std_error = map(float, found)
+            if not (math.isfinite(rate) and 0.0 <= std_error < math.inf):
                 expected = "a rate and its standard error, or an Estimate"
                 raise HarnessError(f"{self._name}, result", repr(found), expected, "Fix what it returns.")
-            found = self.estimate(float(rate), float(std_error), None, confidence)
+            found = self.estimate(rate, std_error, None, confidence)
         return replace(found, warnings=(*found.warnings, note("own")))
 
     def _call(self, work: Callable[..., Any], *given: Any) -> Any:

@@ -60,17 +60,18 @@ def hour_lines(content: Mapping[str, Any], report: Path | None = None, *, readin
 def _sum_rows(content: Mapping[str, Any], *, readings: bool) -> Iterator[Row]:
     """Crashes per hour, and beside the competent driver."""
     hour, seen, decision = content["per_hour"], content["n_crashes"] > 0, content["decision"]
+    what = f"crashes > {plain(above)} m/s" if (above := content.get("counts_above_mps")) else "crashes"
     # Where few tests have rejected a limit upper ends say nothing.
     wide = hour["rhw"] is None or hour["rhw"] > WIDE_RHW
     from_below = wide and decision is not None and decision["verdict"] == "rejected"
     if from_below:
-        yield Row("rate", "crashes so far", f"> {number(hour['ci_low'])} per hour", f"estimate {number(hour['rate'])}")
+        yield Row("rate", f"{what} so far", f"> {number(hour['ci_low'])} per hour", f"estimate {number(hour['rate'])}")
     elif seen:
         ends = between(hour["ci_low"], hour["ci_high"], hour["rate"])
         per_km = f"{number(content['per_1e6_km'])} per million km"
-        yield Row("rate", "crashes", f"{number(hour['rate'])} per hour", ends, per_km)
+        yield Row("rate", what, f"{number(hour['rate'])} per hour", ends, per_km)
     else:
-        yield Row("rate", "crashes", f"< {number(hour['upper_bound'])} per hour", "no crash seen")
+        yield Row("rate", what, f"< {number(hour['upper_bound'])} per hour", "no crash seen")
     softened = any(n_softened(of["before_event"]) for of in content["families"].values())
     how = {"seen": seen, "from_below": from_below, "softened": softened}
     yield beside_row("× competent driver", content["beside"], **how)
@@ -162,6 +163,8 @@ def _scope(content: Mapping[str, Any]) -> str:
     if content["stopped_by"] == "rhw" and (rhw := content["per_hour"]["rhw"] or math.inf) > 1.005 * target:
         here = words.reached_words(rhw, share(rhw)).removeprefix(", at ")
         ended += f" as it was run; here {here}: to narrow it, run anew"
+    if content["stopped_by"] == "accept" and content["decision"] is None:
+        ended += " at the exposures of the run"
     if content["stopped_by"] not in ("rhw", "accept", "below_reference") and target is not None:
         rhw = content["per_hour"]["rhw"]
         ended += f"{'' if rhw is None else words.reached_words(rhw, share(rhw))} (asked: ± {share(target)})"

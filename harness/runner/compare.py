@@ -19,7 +19,7 @@ from harness.campaign.campaign import Campaign
 from harness.campaign.files import campaign_of
 from harness.campaign.sections import MOST_EVENTS
 from harness.campaign.vehicle import Limits
-from harness.errors import CampaignError, told_of
+from harness.errors import CampaignError, RunFolderError, told_of
 from harness.estimators.answer import ended_by
 from harness.estimators.estimate import finite_json
 from harness.estimators.likelihood import Level
@@ -137,6 +137,9 @@ def compare_campaigns(
     folders = {name: name for name in a.scenarios} if a.scenarios else {a.scenario: ""}
     if stored is not None:
         stored = Path(stored)
+        if out.resolve().is_relative_to(stored.resolve()):
+            expected = "a folder outside of that of A's run, which is copied into it"
+            raise RunFolderError("--out", str(out), expected, "Choose another folder with --out.")
         _require_stored(stored, [*folders.values()], a)
     if margin is not None and rhw is not None:
         expected = "one end of the comparison"

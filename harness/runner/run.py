@@ -141,7 +141,8 @@ def run_families(campaign: Campaign, out: Path, *, workers: int | None, resume: 
     asked = {
         "format": 1, "name": campaign.name, "campaign_crc32": zlib.crc32(yaml),
         "seed": campaign.seed, "engine": campaign.world.engine,
-        "exposure": campaign.exposure, "asked_rhw": campaign.stop.rhw, "each_family": campaign.stop.each_family,
+        "exposure": campaign.exposure, "counts_above_mps": campaign.crash.counts_above_mps,
+        "asked_rhw": campaign.stop.rhw, "each_family": campaign.stop.each_family,
         "stopped_by": ended_by(campaign, rule, hour.totals[0]), "decision": decision and decision.to_json(),
         "vehicle": vehicle, "parameters": parameters, "wall_time_s": round(time.monotonic() - began, 3),
     }  # fmt: skip

@@ -305,6 +305,8 @@ def read_families(folder: Path) -> dict[str, Any]:
     if not (folder / FAMILIES).is_file():
         found, expected = "a run of one scenario", "a folder of several, which has families.json"
         mend = "Leave out --exposure: one scenario has no rate per hour."
+        if (folder / COMPARISON).is_file():
+            found, mend = "a comparison", "Compare again with --set exposure.lead_brakes=… and a new --out."
         if (folder.resolve().parent / FAMILIES).is_file():
             mend = f"Name {folder.parent}, the folder of all."
         raise RunFolderError(str(folder), found, expected, mend)
@@ -352,8 +354,11 @@ def estimate_families(
         families.append(OfFamily(name, exposure_of(resolved, given), seen))
         told[name] = read_as(Estimates, of / ESTIMATES, mend=MEND), manifest
     answer = hour_answer(PerHour(families), ready, told, confidence or stored["confidence"], counts=counts)
-    decision = stored["decision"] if given == stored["exposure"] else None  # which the run took at its own
-    return StoredEstimates(finite_json({**stored, "exposure": given, "decision": decision, **answer}), folder)
+    # A verdict is of the exposures that its run has had, which the answer keeps where it has others.
+    ran = stored.get("ran") or {name: stored[name] for name in ("exposure", "decision")}
+    decision, kept = (None, {"ran": ran}) if given != ran["exposure"] else (ran["decision"], {})
+    stored = {name: of for name, of in stored.items() if name != "ran"}
+    return StoredEstimates(finite_json({**stored, **kept, "exposure": given, "decision": decision, **answer}), folder)
 
 
 @checked("harness.write_report")

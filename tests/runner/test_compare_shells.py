@@ -122,6 +122,8 @@ def test_a_stored_run_of_a_is_taken_over(done, campaigns, tmp_path, driven):
     assert sum(driven) == manifest(tmp_path / "out" / "a")["n_episodes"] + done.content["n_pairs"]
     with pytest.raises(RunFolderError, match="a run of campaign"):
         compare_campaigns(*campaigns, tmp_path / "other", stored=done.folder / "b")
+    with pytest.raises(RunFolderError, match="a folder outside of"):
+        compare_campaigns(*campaigns, tmp_path / "stored" / "in_it", stored=tmp_path / "stored")
 
 
 def test_no_test_that_is_there_is_thrown_away_where_a_file_is_gone(done, campaigns, tmp_path):

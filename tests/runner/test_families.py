@@ -195,7 +195,13 @@ def test_a_verdict_is_of_the_exposures_that_it_was_reached_with(tmp_path):
     verdict = run.content["decision"]
     assert verdict["verdict"] == "rejected"
     assert estimate_families(run.folder, confidence=0.5)["decision"] == verdict
-    assert estimate_families(run.folder, {"lead_brakes": 1e-6})["decision"] is None
+    other = estimate_families(run.folder, {"lead_brakes": 1e-6})
+    assert other["decision"] is None
+    assert "stopped: verdict reached at the exposures of the run" in " ".join(repr(other).split())
+    write_sealed(run.folder / "families.json", dict(other))  # with its own the verdict is there again
+    stored = json.loads((run.folder / "families.json").read_text())
+    write_sealed(run.folder / "families.json", {**stored, "exposure": {}})
+    assert estimate_families(run.folder)["decision"] == verdict
 
 
 @pytest.mark.parametrize("wrong", ["1e300", "1e-320", "nan", "x", 0.0, 1e300, True])
@@ -244,6 +250,11 @@ def test_where_few_tests_reject_only_the_lower_ends_are_told(run, rhw, low, show
     used_up = {**content, "stopped_by": "episodes", "asked_rhw": 0.3, "per_hour": {**per_hour, "rhw": 1e3 * rhw}}
     assert "at over ± 1,000 % (asked: ± 30 %)" in " ".join(" ".join(hour_lines(used_up)).split())
     assert ("crashes so far      > 1.00 × 10⁻³ per hour" in told, ratio, "to 900" in told) == (shown, shown, not shown)
+
+
+def test_which_crashes_count_is_said(run):
+    assert hour_lines(run.content)[1].startswith("  crashes  ")
+    assert hour_lines({**run.content, "counts_above_mps": 3.0})[1].startswith("  crashes > 3 m/s  ")
 
 
 def test_the_hardest_crash_of_all_scenarios_is_replayed(run, capsys):

@@ -20,7 +20,7 @@ for episode in range(3):
     while connection.simulation.getMinExpectedNumber() > 0:
         connection.simulationStep()
         if "ego" in connection.simulation.getSubscriptionResults()[VAR_DEPARTED_VEHICLES_IDS]:
-            connection.vehicle.subscribeContext("ego", CMD_GET_VEHICLE_VARIABLE, 1000.0, AROUND)
+            connection.vehicle.subscribeContext("ego", CMD_GET_VEHICLE_VARIABLE, 1000.0, AROUND, begin=0.0, end=100.0)
         around = connection.vehicle.getContextSubscriptionResults("ego")
         own = around.pop("ego")
         ahead = [

@@ -37,7 +37,7 @@ class Simulation:
             for name in traci.simulation.getDepartedIDList():
                 traci.vehicle.subscribe(name, [tc.VAR_SPEED, tc.VAR_LANEPOSITION])
                 if name == self.settings.ego:
-                    traci.vehicle.subscribeLeader(name)
+                    traci.vehicle.subscribeLeader(name, dist=50.0, begin=0.0)
             self.seen = traci.vehicle.getAllSubscriptionResults()
             self.own = traci.vehicle.getSubscriptionResults(self.settings.ego)
             self.history.append(self.own)
