@@ -39,7 +39,7 @@ def folder(stored_run, tmp_path):
         yield out
 
 
-def test_check_prints_a_campaign_file(capsys, tmp_path):
+def test_check_prints_a_campaign_file(capsys, tmp_path, monkeypatch):
     assert main(["check", SMOKE, "--set", "stop.rhw=0.2"]) == 0
     output = capsys.readouterr().out
     (tmp_path / "resolved.yaml").write_text(output)
@@ -48,6 +48,13 @@ def test_check_prints_a_campaign_file(capsys, tmp_path):
     assert main(["check", SMOKE, "--json"]) == 0
     output = json.loads(capsys.readouterr().out)
     assert output["stop"] == {**output["stop"], "rhw": 0.3, "episodes": 400_000}
+    (tmp_path / "my_av.py").write_text(
+        "class MyAV:\n    def __init__(self, file): ...\n    def step(self, seen): return 0.0\n"
+    )
+    asked = f"{tmp_path}/my_av.py:MyAV", "--set", f"av.parameters.file={tmp_path}/my_av.py"
+    monkeypatch.chdir(tmp_path)  # what is relative to a campaign file may move with it; parameters are not
+    assert main(["check", *asked]) == 0
+    assert f'file: "{tmp_path}/my_av.py"' in capsys.readouterr().out
 
 
 def test_run_prints_the_answer_and_where_more_is(folder, capsys):

@@ -15,6 +15,7 @@ from harness.campaign.campaign import Campaign
 from harness.campaign.drivers import IDMParameters, Surrogate
 from harness.campaign.files import QUICK, load_campaign, load_panel, schema_text
 from harness.campaign.models import read_model
+from harness.campaign.python_files import files_imported, is_script
 from harness.campaign.vehicle import AutomatedVehicle
 from harness.cli import main
 from harness.errors import EXIT_BAD_INPUT, CampaignError
@@ -339,3 +340,12 @@ def test_the_commands_take_a_vehicle(tmp_path, capsys, monkeypatch):
     assert [campaign.av for campaign in seen] == [AutomatedVehicle(), load_panel().avs["SM-II"]]
     assert main(["run", str(file), "--out", str(tmp_path / "r"), "--av", "nobody"]) == 2
     assert capsys.readouterr().err.startswith("error: --av nobody\n")
+
+
+def test_modules_of_any_size_and_encoding_are_read_as_python_does(tmp_path):
+    (tmp_path / "big.py").write_text(f"import latin\nTABLE = [{'0.1, ' * 30_000}]\n")
+    (tmp_path / "latin.py").write_bytes(b"# -*- coding: latin-1 -*-\nimport traci  # \xe9\n")
+    (tmp_path / "my_av.py").write_text("import big\n")
+    names = {file.name for file in files_imported(tmp_path / "my_av.py", tmp_path)}
+    assert names == {"my_av.py", "big.py", "latin.py"}
+    assert is_script(str(tmp_path / "latin.py"))
