@@ -131,7 +131,7 @@ class ShellSettings(Section):
     statement: Literal["assumption_free", "library"] = "assumption_free"
     """what stop.rhw or accept is about; library: if the vehicle crashes only inside the library's boundary, outside of
     which nothing is tested then"""
-    first_tests: Annotated[int, Field(ge=1, le=10_000), BeforeValidator(whole)] | None = None
+    first_tests: Annotated[int, Field(ge=3, le=10_000), BeforeValidator(whole)] | None = None
     """tests of each shell before any is preferred; none: by its probability"""
     smallest_round: Whole = Field(1, ge=1, le=10_000)
     """fewest tests of a round; raise it for many workers"""
