@@ -294,10 +294,15 @@ class RoundRule(Rule):
         However many tests there are, they repeat these runs: what a vehicle that acts before the event does in a share
         of drives below 1 - (1 - confidence)^(1/n), none of n runs may show.
         """
-        designs = [of.seen.design for of in seen.families] if isinstance(seen, PerHour) else [seen.design]
-        runs = min((each.n_independent for each in designs if each.shadow_runs), default=math.inf)
+        if isinstance(seen, PerHour):
+            each = [(of.p, of.seen.design) for of in seen.families]
+        else:
+            each = [(seen.design.p, seen.design)]
+        repeats = [(float(p.sum()), design.n_independent) for p, design in each if design.shadow_runs]
+        runs = min((n for _, n in repeats), default=math.inf)
         unseen = -math.expm1(math.log1p(-found.confidence) / runs)
-        times = unseen * found.n_episodes / seen.expected(found.limit, found.driver, ASSUMPTION_FREE)
+        share = math.fsum(p for p, _ in repeats) / math.fsum(float(p.sum()) for p, _ in each)
+        times = share * unseen * found.n_episodes / seen.expected(found.limit, found.driver, ASSUMPTION_FREE)
         return two_digits_up(runs * times) if times > 1.0 else 0
 
 

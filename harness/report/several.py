@@ -112,9 +112,10 @@ def sum_warnings(content: Mapping[str, Any]) -> Iterator[str]:
         limit, over = decision["limit"], decision.get("over_assumed")
         turned = over is not None and (end(over[1]) >= limit if verdict == "accepted" else over[0] <= limit)
         if turned or (ends is not None and decision["driver"] and ends[0] <= limit <= ends[1]):
+            sign, as_text = ("× ", ratio) if decision["driver"] else ("", number)
             low, high = over if turned else ends
-            most = "no limit" if high is None else ratio(high)
-            yield f"assumed numbers may turn this verdict: × {ratio(low)} to {most} over their ranges"
+            most = "no limit" if high is None else as_text(high)
+            yield f"assumed numbers may turn this verdict: {sign}{as_text(low)} to {most} over their ranges"
     yield from words.runs_warning(decision)
     for each in content["readings"]:
         if _side(each) != _side(content["beside"]):

@@ -303,10 +303,8 @@ _SHOWN = ("families", "per_hour", "beside", "readings", "decision")
 def read_families(folder: Path) -> dict[str, Any]:
     """``families.json`` of a folder; a `RunFolderError` where it is missing, damaged, or another version's."""
     if not (folder / FAMILIES).is_file():
-        found, expected = "a run of one scenario", "a folder of several, which has families.json"
-        mend = "Leave out --exposure: one scenario has no rate per hour."
-        if (folder / COMPARISON).is_file():
-            found, mend = "a comparison", "Compare again with --set exposure.lead_brakes=… and a new --out."
+        found, expected = "a comparison, or a run of one scenario", "a folder of several, which has families.json"
+        mend = "Leave out --exposure: one scenario has no rate per hour, and compare takes --set exposure.lead_brakes=…"
         if (folder.resolve().parent / FAMILIES).is_file():
             mend = f"Name {folder.parent}, the folder of all."
         raise RunFolderError(str(folder), found, expected, mend)
@@ -340,25 +338,23 @@ def estimate_families(
 
     Raises `HarnessError`: a run is missing or damaged, or an exposure is of no scenario in it.
     """
-    folder, exposure = Path(folder), exposure or {}
-    stored, families, ready, told = read_families(folder), [], {}, {}
-    names = list(stored["families"])
+    folder, exposure, families, ready, told = Path(folder), exposure or {}, [], {}, {}
+    names = list((stored := read_families(folder))["families"])
     if unknown := sorted(set(exposure) - set(names)):
         found = f"an exposure of {', '.join(unknown)}"
         raise HarnessError("--exposure", found, f"one of {', '.join(names)}", "Name a scenario of this folder.")
     given = {**stored["exposure"], **exposure}
-    for name in names:
-        of = folder / name
+    for name, of in ((name, folder / name) for name in names):
         manifest, seen = read_manifest(of), SeenShells.of_blocks(stored_blocks(of, moments=False))
         resolved = ready[name] = resolve(read_campaign(of, manifest))
         families.append(OfFamily(name, exposure_of(resolved, given), seen))
         told[name] = read_as(Estimates, of / ESTIMATES, mend=MEND), manifest
     answer = hour_answer(PerHour(families), ready, told, confidence or stored["confidence"], counts=counts)
-    # A verdict is of the exposures that its run has had, which the answer keeps where it has others.
-    ran = stored.get("ran") or {name: stored[name] for name in ("exposure", "decision")}
-    decision, kept = (None, {"ran": ran}) if given != ran["exposure"] else (ran["decision"], {})
-    stored = {name: of for name, of in stored.items() if name != "ran"}
-    return StoredEstimates(finite_json({**stored, **kept, "exposure": given, "decision": decision, **answer}), folder)
+    ran = stored.pop("ran", None) or {name: stored[name] for name in ("exposure", "decision")}
+    stored["decision"] = ran["decision"]
+    if given != ran["exposure"]:  # a verdict is of those of its run
+        stored |= {"decision": None, "ran": ran}
+    return StoredEstimates(finite_json({**stored, "exposure": given, **answer}), folder)
 
 
 @checked("harness.write_report")
