@@ -245,7 +245,7 @@ def hardest_crash(folder: Path) -> tuple[Path, int]:
             speed_mps, episode = (each.to_pylist() for each in columns.itercolumns())
             crashes += [(-each, number, run) for each, number in zip(speed_mps, episode, strict=True)]
     if not crashes:
-        expected, mend = "the number of a test to replay", "Name one: harness replay DIR 0."
+        expected, mend = "the number of a test to replay", f"Name one: harness replay {run} 0."
         raise RunFolderError(str(folder), "no crash", expected, mend)
     _, number, run = min(crashes)
     return run, number

@@ -165,7 +165,7 @@ def _scope(content: Mapping[str, Any]) -> str:
         here = words.reached_words(rhw, share(rhw)).removeprefix(", at ")
         ended += f" as it was run; here {here}: to narrow it, run anew"
     if content["stopped_by"] == "accept" and content["decision"] is None:
-        ended += " at the exposures of the run"
+        ended += f" ({content['ran']['decision']['verdict']}) at the exposures of the run"
     if content["stopped_by"] not in ("rhw", "accept", "below_reference") and target is not None:
         rhw = content["per_hour"]["rhw"]
         ended += f"{'' if rhw is None else words.reached_words(rhw, share(rhw))} (asked: ± {share(target)})"
@@ -228,7 +228,7 @@ def deciding_words(content: Mapping[str, Any], s_per_pair: float | None = None) 
     if decision["margin"] is not None and doubted:  # which no more pairs would mend
         return None
     if not content["n_only_a"] + content["n_only_b"]:
-        return "in no pair of tests did they differ"
+        return "in no pair of tests did only one crash"
     if (needed := content["to_decide"]) is None:
         return "how many pairs would decide is not known: so far the two are too alike"
     where, pairs, done = (

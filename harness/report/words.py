@@ -22,7 +22,7 @@ from harness.estimators.block import BRAKED_MPS2
 from harness.estimators.severity import TOUCH_MPS
 from harness.families import family_named
 from harness.loop.cells import FAR_BEHIND_S
-from harness.numbers import WIDEST_RHW, count, duration, interval, leaves, number, plain, share, words
+from harness.numbers import WIDEST_RHW, count, duration, interval, leaves, number, plain, share, two_digits_up, words
 from harness.report.notes import note_words
 from harness.report.rows import Row, end, held_back, rows_of, too_few, with_traffic
 from harness.sampling.paths import n_left_out
@@ -164,7 +164,8 @@ def warnings_of(scenario: str, of: Mapping[str, Any], unit: str, but: str = "") 
         again = count(repeated["n_episodes"])
         yield f"NOT REPRODUCIBLE: {count(n)} of {again} tests that ran twice differed: see `harness av-check`"
     if (missed := of.get("missed")) and missed["rate"] > of["ci_high"]:
-        what = f"crashes there, up to {number(missed['rate'])}{unit}, are in no limit (pool.shadow_paths)"
+        n = two_digits_up(missed["n_runs"] * missed["rate"] / of["ci_high"])
+        what = f"crashes there, up to {number(missed['rate'])}{unit}, are in no limit (pool.shadow_paths={n})"
         yield f"{count(missed['n_runs'])} baseline runs may miss what it does in 1 of {missed['drives']} drives: {what}"
     if n := of["n_failed"]:
         failed, had = f"{count(n)} of {count(of['n_episodes'])}", f"{number(of['if_failed_had_crashed'])}{unit}"

@@ -257,7 +257,7 @@ def changed_since(manifest: Mapping[str, Any], campaign: Campaign) -> str:
         same = "" if other else "Versions, CPU and the controller's files are the run's. "
         found.append(
             f"{same}Or the vehicle does not do the same again: random numbers of its own, memory of earlier tests, "
-            "or a file that it reads. `harness av-check` looks for that."
+            "or a file that it reads. `harness av-check --tests 400` looks for that."
         )
     return " ".join(found) or "Versions and CPU are the run's: the records have been changed, or it is a defect."
 

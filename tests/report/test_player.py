@@ -136,7 +136,7 @@ def test_without_a_number_the_hardest_crash_is_replayed(stored_run, tmp_path, ca
     run_here(golden("nde-twin", "stop.episodes=5"), tmp_path / "run")
     with pytest.raises(harness.HarnessError, match="no crash") as refused:
         harness.replay(tmp_path / "run")
-    assert refused.value.mend == "Name one: harness replay DIR 0."
+    assert refused.value.mend == f"Name one: harness replay {tmp_path / 'run'} 0."
 
 
 @pytest.mark.parametrize(

@@ -197,7 +197,7 @@ def test_a_verdict_is_of_the_exposures_that_it_was_reached_with(tmp_path):
     assert estimate_families(run.folder, confidence=0.5)["decision"] == verdict
     other = estimate_families(run.folder, {"lead_brakes": 1e-6})
     assert other["decision"] is None
-    assert "stopped: verdict reached at the exposures of the run" in " ".join(repr(other).split())
+    assert "stopped: verdict reached (rejected) at the exposures of the run" in " ".join(repr(other).split())
     write_sealed(run.folder / "families.json", dict(other))  # with its own the verdict is there again
     stored = json.loads((run.folder / "families.json").read_text())
     write_sealed(run.folder / "families.json", {**stored, "exposure": {}})
