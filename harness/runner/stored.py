@@ -351,9 +351,9 @@ def estimate_families(
         told[name] = read_as(Estimates, of / ESTIMATES, mend=MEND), manifest
     answer = hour_answer(PerHour(families), ready, told, confidence or stored["confidence"], counts=counts)
     ran = stored.pop("ran", None) or {name: stored[name] for name in ("exposure", "decision")}
-    stored["decision"] = ran["decision"]
-    if given != ran["exposure"]:  # a verdict is of those of its run
-        stored |= {"decision": None, "ran": ran}
+    was = [exposure_of(of, ran["exposure"]).per_hour for of in ready.values()]
+    moved = was != [of.exposure.per_hour for of in families]  # a verdict is of those of its run
+    stored |= {"decision": None, "ran": ran} if moved else {"decision": ran["decision"]}
     return StoredEstimates(finite_json({**stored, "exposure": given, **answer}), folder)
 
 

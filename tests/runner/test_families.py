@@ -200,8 +200,9 @@ def test_a_verdict_is_of_the_exposures_that_it_was_reached_with(tmp_path):
     assert "stopped: verdict reached (rejected) at the exposures of the run" in " ".join(repr(other).split())
     write_sealed(run.folder / "families.json", dict(other))  # with its own the verdict is there again
     stored = json.loads((run.folder / "families.json").read_text())
-    write_sealed(run.folder / "families.json", {**stored, "exposure": {}})
-    assert estimate_families(run.folder)["decision"] == verdict
+    shipped = run.content["families"]["lead_brakes"]["exposure"]["per_hour"]
+    assert stored["decision"] is None
+    assert estimate_families(run.folder, {"lead_brakes": shipped})["decision"] == verdict
 
 
 @pytest.mark.parametrize("wrong", ["1e300", "1e-320", "nan", "x", 0.0, 1e300, True])
