@@ -24,6 +24,7 @@ from harness.campaign.campaign import Campaign
 from harness.campaign.sections import Accept, Stop
 from harness.estimators.estimate import Estimate, Note, finite_json, note
 from harness.estimators.likelihood import Level
+from harness.estimators.limits import clopper_pearson
 from harness.estimators.pairs import PairDecision, Pairs, PairVerdict
 from harness.estimators.per_hour import PerHour
 from harness.estimators.shells import SeenShells
@@ -292,15 +293,17 @@ class RoundRule(Rule):
         """Baseline runs to see what would break the limit if it crashed on all events; 0 where there are enough.
 
         However many tests there are, they repeat these runs: what a vehicle that acts before the event does in a share
-        of drives below 1 - (1 - confidence)^(1/n), none of n runs may show.
+        of drives below the upper limit of 0 of n, none of n runs may show.
         """
         if isinstance(seen, PerHour):
             each = [(of.p, of.seen.design) for of in seen.families]
         else:
             each = [(seen.design.p, seen.design)]
         repeats = [(float(p.sum()), design.n_independent) for p, design in each if design.shadow_runs]
-        runs = min((n for _, n in repeats), default=math.inf)
-        unseen = -math.expm1(math.log1p(-found.confidence) / runs)
+        if not repeats:
+            return 0
+        runs = min(n for _, n in repeats)
+        unseen = float(clopper_pearson(0, runs, 1.0 - found.confidence)[1])
         share = math.fsum(p for p, _ in repeats) / math.fsum(float(p.sum()) for p, _ in each)
         times = share * unseen * found.n_episodes / seen.expected(found.limit, found.driver, ASSUMPTION_FREE)
         return two_digits_up(runs * times) if times > 1.0 else 0

@@ -19,6 +19,7 @@ from harness.campaign.campaign import Campaign
 from harness.campaign.vehicle import AutomatedVehicle
 from harness.estimators.answer import MANY, STORED_ESTIMATES, Elsewhere, Estimates, before_event
 from harness.estimators.block import BRAKED_MPS2
+from harness.estimators.limits import clopper_pearson
 from harness.estimators.severity import TOUCH_MPS
 from harness.families import family_named
 from harness.loop.cells import FAR_BEHIND_S
@@ -136,7 +137,7 @@ def _missed(manifest: Mapping[str, Any], told: Estimates, times: float) -> dict[
     runs, shells = manifest.get("shadow_runs"), told.best.details.get("shells")
     if not runs or not shells:
         return None
-    share_unseen = -math.expm1(math.log1p(-told.confidence) / runs["n_runs"])
+    share_unseen = float(clopper_pearson(0, runs["n_runs"], 1.0 - told.confidence)[1])
     rate = times * share_unseen * math.fsum(each["p"] for each in shells)
     return {"n_runs": runs["n_runs"], "drives": round(1.0 / share_unseen), "rate": rate}
 

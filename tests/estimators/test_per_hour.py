@@ -12,9 +12,10 @@ from harness.campaign.files import load_campaign
 from harness.estimators.likelihood import Level, likelihood_limit
 from harness.estimators.per_hour import OfFamily, PerHour
 from harness.estimators.shells import SeenShells
-from harness.estimators.stopping import RoundRule
+from harness.estimators.stopping import Decision, RoundRule
 from harness.estimators.tally import Tally
 from harness.families.protocol import Exposure
+from harness.numbers import two_digits_up
 from harness.sampling.shells import HourRounds
 from harness.strata import Assumed, Reference, ShellDesign
 
@@ -64,13 +65,28 @@ def test_limits_over_assumed_exposures_are_the_outermost():
         assert found.limits_over_assumed(LEVEL, ratio=ratio) == pytest.approx(outermost)
 
 
+def test_baseline_runs_for_a_verdict_are_those_of_the_scenarios_that_repeat_them():
+    repeats = {"shadow_runs": True, "n_paths": 500, "candidates": 10**12}
+    cut_in, *others = (replace_design(of, **(repeats if of.family == "cut_in" else {})) for of in THREE)
+    hour, share = PerHour([cut_in, *others]), 1.0 - 0.05 ** (1 / 500)
+    rule = RoundRule(load_campaign("idm", ["accept={times_reference: {driver: r157-cc}}"]))
+    for limit in (1e-4, 10.0):
+        found = Decision(limit, "assumption_free", 0.95, 0.0, 0.0, hour.totals[0], driver="r157-cc")
+        times = share * cut_in.p.sum() / (limit * hour.reference_rate)
+        assert rule._runs_needed(hour, found) == (two_digits_up(500 * times) if times > 1.0 else 0)
+        assert rule._runs_needed(PerHour(THREE), found) == 0
+
+
+def replace_design(of, **changes):
+    seen = SeenShells()
+    seen.count(replace(of.seen.design, **changes), of.tally)
+    return of._replace(seen=seen)
+
+
 def test_of_a_vehicle_that_provokes_events_an_hour_counts_those_ahead_of_others():
-    (holds,), design = THREE[:1], THREE[0].seen.design
-    holds.seen.design = replace(design, p_event=2.0 * design.p_event, p_held=design.p_event)
-    try:
-        assert holds.per_hour == COUNTED.per_hour / design.p_event
-    finally:
-        holds.seen.design = design
+    p_event = THREE[0].seen.design.p_event
+    provokes = replace_design(THREE[0], p_event=2.0 * p_event, p_held=p_event)
+    assert provokes.per_hour == COUNTED.per_hour / p_event
 
 
 def test_the_sum_and_its_limits_are_those_of_all_strata_side_by_side():
