@@ -248,6 +248,9 @@ class Repeated:
     n_episodes: Count
     differing: list[Count]
 
+    def __add__(self, other: Repeated) -> Repeated:
+        return Repeated(self.n_episodes + other.n_episodes, sorted({*self.differing, *other.differing}))
+
 
 class StoredManifest(BaseModel):
     """What ``manifest.json`` of a run must hold, and of what it may hold that which answers rest on.

@@ -163,7 +163,7 @@ def warnings_of(scenario: str, of: Mapping[str, Any], unit: str, but: str = "") 
     yield from map(note_words, of["cautions"])
     if n := len(repeated.get("differing", ())):
         again = count(repeated["n_episodes"])
-        yield f"NOT REPRODUCIBLE: {count(n)} of {again} tests that ran twice differed: see `harness av-check`"
+        yield f"NOT REPRODUCIBLE: {count(n)} of {again} tests run twice differed: see `harness av-check --tests 400`"
     if (missed := of.get("missed")) and missed["rate"] > of["ci_high"]:
         n = two_digits_up(missed["n_runs"] * missed["rate"] / of["ci_high"])
         what = f"crashes there, up to {number(missed['rate'])}{unit}, are in no limit (pool.shadow_paths={n})"

@@ -140,12 +140,15 @@ class Run:
     def with_shard(self, shard: ShardResult) -> Run:
         """The next tests; what there is by then is written every few seconds."""
         drawn = self.blocks[0].drawn if self.blocks else shard.block.drawn  # each from a worker has brought its own
+        repeated, new = self.repeated, shard.repeated
+        if new and (not repeated or not self.is_behind):  # what is behind the earlier run is in its sum already
+            repeated = repeated + new if repeated else new
         run = replace(
             self,
             open=(*self.open, shard),
             blocks=(*self.blocks, replace(shard.block, drawn=drawn)),
             shown=(*self.shown, ShownTests.of(shard.tables["episodes"], self.resolved.family)),
-            repeated=shard.repeated or self.repeated,
+            repeated=repeated,
         )
         n_rows = sum(table.num_rows for each in run.open for table in each.tables.values())
         if run.n_episodes - run.open[0].request.first_episode >= PART_TESTS or n_rows >= PART_ROWS:

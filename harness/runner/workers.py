@@ -28,7 +28,7 @@ from harness.processes import Began, Child, SharedFile, WorkerDeath, first_to_an
 from harness.records.folder import MILDER, Repeated, Tables, read_table
 from harness.records.schemas import shard_tables
 from harness.resolved import Resolved
-from harness.runner.again import repeat
+from harness.runner.again import is_repeated, repeat
 from harness.sampling import prepare
 from harness.sampling.paths import BaselineResult, as_recorded, run_baseline, run_milder
 from harness.sampling.protocol import ShardRequest
@@ -54,7 +54,7 @@ class ShardResult:
     block: Block
     is_new: bool = True
     repeated: Repeated | None = None
-    """What tests have shown that were run twice: some of the first shard, or none."""
+    """What tests have shown that were run twice, of a shard where `is_repeated`."""
 
 
 Result = ShardResult | BaselineResult
@@ -118,7 +118,7 @@ class ShardRunner:
         keep_traces = campaign.records.traces != "none" or campaign.records.trace_share > 0.0
         tables = shard_tables(shard, campaign.seed, keep_traces=keep_traces)
         # A vehicle must show that it does the same again: built-in models do, and outside programs need not.
-        shows = request.index == 0 and campaign.av.model is None and campaign.av.traci is None
+        shows = is_repeated(request) and campaign.av.model is None and campaign.av.traci is None
         repeated = repeat(self._loop, source, shard) if shows else None
         return ShardResult(request, tables, source.block(tables), repeated=repeated)
 

@@ -213,6 +213,18 @@ class Global(IDM):
         return super().step(seen) - 1e-9 * random.random()
 
 
+class Tires(IDM):
+    """Answers otherwise once its class has driven 150 tests."""
+
+    n_driven = 0
+
+    def start(self, episode):
+        Tires.n_driven += 1
+
+    def step(self, seen):
+        return super().step(seen) - 1e-9 * (Tires.n_driven > 150)
+
+
 class Replaces(IDM):
     """Puts nothing in place of a module, or of what it or a class of it holds; of the judge one that ends no test."""
 

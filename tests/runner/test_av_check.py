@@ -300,16 +300,23 @@ def test_a_vehicle_that_does_not_is_found_out_for_any_number_of_workers_and_afte
     folders = [run_av(GLOBAL, name="1"), run_av(GLOBAL, name="2", run=run_with_workers, workers=2)]
     one, two = (read_manifest(folder) for folder in folders)
     assert one["repeated"] == two["repeated"]
-    assert len(one["repeated"]["differing"]) == one["repeated"]["n_episodes"] == 10
+    assert len(one["repeated"]["differing"]) == one["repeated"]["n_episodes"] == 20
     assert (one["reproducible"], two["reproducible"]) == (False, False)
     warnings = answer_in(folders[0])["warnings"]
-    assert any(told.startswith("NOT REPRODUCIBLE: 10 of 10 tests") for told in warnings)
-    with pytest.raises(CampaignError, match="10 of the 10 tests that it ran twice differed"):
+    assert any(told.startswith("NOT REPRODUCIBLE: 20 of 20 tests") for told in warnings)
+    with pytest.raises(CampaignError, match="20 of the 20 tests that it ran twice differed"):
         replay_episode(folders[0], 3)
     copied = copy_of(folders[0], tmp_path / "copy")
     run_av(GLOBAL, "stop.episodes=500", name=copied.name, resume=True)
     longer = read_manifest(copied)
     assert (longer["repeated"], longer["reproducible"], longer["n_episodes"]) == (one["repeated"], False, 500)
+
+
+def test_a_vehicle_that_differs_later_on_is_found_by_what_repeats_later_tests(run_av):
+    repeated = read_manifest(run_av(GLOBAL.replace("Global", "Tires"), run=run_with_workers, workers=1))["repeated"]
+    assert repeated["n_episodes"] == 20
+    assert all(episode >= 150 for episode in repeated["differing"])
+    assert len(repeated["differing"]) == 10
 
 
 def test_a_replay_that_differs_names_what_it_knows(stored_run, tmp_path):
