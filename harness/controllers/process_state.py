@@ -7,15 +7,10 @@ either changes numbers of the harness, or breaks it elsewhere.
 from __future__ import annotations
 
 import ctypes
-import os
 import platform
-import signal
 import sys
-import threading
 from collections.abc import Callable
-from contextlib import ExitStack
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 WATCHED = (
@@ -59,11 +54,10 @@ class FloatingPointModes:
 
 
 class OtherModules:
-    """What the harness rests on when it is made: modules, what they and classes hold, and how others are imported."""
+    """What the harness rests on when it is made: modules, and what they and classes hold."""
 
     def __init__(self) -> None:
-        self._loaded, self._finders, self._depth = dict(sys.modules), list(sys.meta_path), sys.getrecursionlimit()
-        self._blocked = signal.pthread_sigmask(signal.SIG_BLOCK, ())
+        self._loaded = dict(sys.modules)
         watched = [name for name in self._loaded if name in WATCHED or name.partition(".")[0] == OURS[0]]
         held: dict[str, Any] = {name: self._loaded[name] for name in watched}
         types = [each for module in held.values() for each in vars(module).values() if isinstance(each, type)]
@@ -79,30 +73,7 @@ class OtherModules:
             for key in [key for key, value in kept.items() if vars(place).get(key, self) is not value]:
                 setattr(place, key, kept[key])
                 changed.append(f"{name}.{key}")
-        if lost := [finder for finder in self._finders if finder not in (sys.meta_path or ())]:
-            sys.meta_path = [*(sys.meta_path or ()), *lost]
-            changed.append("sys.meta_path")
-        for module in (sys, threading):
-            if not callable(module.excepthook):
-                module.excepthook = module.__excepthook__  # type: ignore[attr-defined]
-                changed.append(f"{module.__name__}.excepthook")
-        if sys.getrecursionlimit() < self._depth:
-            sys.setrecursionlimit(self._depth)
-            changed.append("sys.setrecursionlimit")
-        if signal.pthread_sigmask(signal.SIG_SETMASK, self._blocked) != self._blocked:
-            changed.append("signal.pthread_sigmask")
         return changed
-
-
-def closed_to_files() -> str:
-    """Why 16 files [assumed: more than the harness needs at a time] cannot be opened; empty where they can."""
-    try:
-        with ExitStack() as files:
-            for _ in range(16):
-                files.enter_context(Path(os.devnull).open("rb"))
-    except OSError as error:
-        return str(error.strerror)
-    return ""
 
 
 def _functions_and_numbers(held: dict[str, Any]) -> dict[str, Any]:

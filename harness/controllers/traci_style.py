@@ -30,7 +30,6 @@ class SimulationDomain(Domain):
     time_s = 0.0
 
     def getTime(self) -> float:
-        """Time since the episode began (s)."""
         return self.time_s
 
     getDeltaT = staticmethod(lambda: STEP_S)
@@ -51,7 +50,6 @@ class Traci(Domain):
 
     @property
     def constants(self) -> ModuleType:
-        """Numbers to subscribe by."""
         return importlib.import_module("traci.constants")
 
     def see(self, now: Observation) -> None:

@@ -166,49 +166,40 @@ class VehicleDomain(Domain):
     # -- questions --
 
     def getIDList(self) -> tuple[str, ...]:
-        """The cell's vehicles."""
         return tuple(self._seen)
 
     def getIDCount(self) -> int:
-        """Their number."""
         return len(self._seen)
 
     def subscribe(self, objectID: str, varIDs: Sequence[int] | None = None, *_when: Any, **_how: Any) -> None:
-        """Ask for variables (numbers of ``traci.constants``), for the whole test; by default road and position."""
         self._of(objectID)
         self._subscribed[objectID] = known_variables(varIDs, _VARIABLES, "vehicles")
 
     def subscribeLeader(self, vehID: str, *_when: Any, **_how: Any) -> None:
-        """Ask for the vehicle ahead, beside what has been asked for."""
         self._of(vehID)
         self._subscribed[vehID] = *self._subscribed.get(vehID, ()), _LEADER
 
     def unsubscribe(self, objectID: str) -> None:
-        """Ask for nothing more."""
         self._subscribed.pop(objectID, None)
 
     def getSubscriptionResults(self, objectID: str) -> dict[int, Any]:
-        """Values of what has been subscribed to, by number; none without."""
         return self._values(objectID, self._subscribed.get(objectID, ()) if objectID in self._seen else ())
 
     def _values(self, objectID: str, variables: Sequence[int]) -> dict[int, Any]:
         return {number: getattr(self, _VARIABLES[number])(objectID) for number in variables}
 
     def getAllSubscriptionResults(self) -> dict[str, dict[int, Any]]:
-        """The same of all vehicles that have been subscribed to."""
         return {name: self.getSubscriptionResults(name) for name in self._subscribed}
 
     def subscribeContext(
         self, objectID: str, domain: int, dist: float, varIDs: Sequence[int] | None = None, *_when: Any, **_how: Any
     ) -> None:
-        """Ask for variables of the vehicles (``domain`` 0xa4) within a distance (m) of one, itself included."""
         self._of(objectID)
         if domain != _VEHICLES:
             raise RefusedError(f"vehicle.subscribeContext of domain {domain:#x} is refused: there are vehicles alone.")
         self._around[objectID] = dist, known_variables(varIDs, _VARIABLES, "vehicles")
 
     def getContextSubscriptionResults(self, objectID: str) -> dict[str, dict[int, Any]]:
-        """Values of what has been subscribed to around a vehicle, by its and their names; none without."""
         dist, variables = self._around.get(objectID, (-1.0, ()))
         here = self.getPosition(objectID)
         near = [name for name in self._seen if math.dist(here, self.getPosition(name)) <= dist]
@@ -223,7 +214,6 @@ class VehicleDomain(Domain):
         return ahead if ahead is not None or self.legacy_leader else ("", -1.0)
 
     def getFollower(self, vehID: str, dist: float = 0.0) -> tuple[str, float]:  # noqa: ARG002 - TraCI's signature
-        """Vehicle behind on the lane and the gap from it (m); ``("", -1.0)`` without one."""
         return self._nearest(vehID, -1.0) or ("", -1.0)
 
     def getNeighbors(self, vehID: str, mode: int) -> tuple[tuple[str, float], ...]:
@@ -256,17 +246,14 @@ class VehicleDomain(Domain):
         self._require_own(vehID, "add")
 
     def setSpeed(self, vehID: str, speed: float) -> None:
-        """Drive at this speed (m/s) from the next step on until told otherwise; -1 releases."""
         self._require_own(vehID, "setSpeed")
         self._begin(None if speed < 0.0 else partial(self._hold, _finite(speed)), math.inf)
 
     def setAcceleration(self, vehID: str, acceleration: float, duration: float) -> None:
-        """Accelerate (m/s²) for a duration (s)."""
         self._require_own(vehID, "setAcceleration")
         self._begin(partial(self._accelerate, _finite(acceleration), duration), duration)
 
     def slowDown(self, vehID: str, speed: float, duration: float) -> None:
-        """Change speed linearly to a value (m/s) in a duration (s)."""
         self._require_own(vehID, "slowDown")
         if not speed >= 0.0:
             raise TraCIException("Speed must not be negative.")

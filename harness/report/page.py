@@ -36,7 +36,8 @@ def write_page_of(run: RunFolder) -> Path:
         figures={plot.name: plot for plot in plots}, family=family, words=family.words, shown=shown_of(family),
         outcomes=list(zip(OUTCOMES, summary.count, summary.weight, strict=True)),
         estimators=sorted(run.estimates.estimates.items(), key=lambda item: item[0] != run.estimates.headline),
-        warnings=[*answer.warnings, *uncovered(run, summary)], diagnostics=diagnostics(run),
+        warnings=[*answer.warnings, *uncovered(run, summary)],
+        diagnostics=[of for of in leaves(run.estimates.diagnostics) if run.shells is None or of[1] not in (None, {})],
         settings=dump_campaign(run.campaign), folder=typed(run.path),
     )  # fmt: skip
 
@@ -130,9 +131,3 @@ def uncovered(run: RunFolder, summary: RunSummary) -> list[str]:
         return []
     found = f"the estimates cover {count(n_estimated)} tests but the records hold {count(n_tests)}"
     return [f"{found}: run harness estimate {typed(run.path)} --write"]
-
-
-def diagnostics(run: RunFolder) -> list[tuple[str, Any]]:
-    """Return sums of the run as (key, value); of shells without those about weights, which have none to say."""
-    found = leaves(run.estimates.diagnostics)
-    return found if run.shells is None else [(path, leaf) for path, leaf in found if leaf not in (None, {})]

@@ -15,14 +15,12 @@ from harness.campaign.models import read_model, shipped_or_own
 from harness.campaign.sections import Section, SurrogateName
 from harness.errors import CampaignError
 from harness.problems import broken_rule, did_you_mean, listed
-from harness.vehicles.drivers import Followers, driver_records
+from harness.vehicles.drivers import MOST_FOLLOWERS, Followers, driver_records
 from harness.vocabulary import RecordArray
 
 SHIPPED_FOLDER = Path(__file__).parent
 OF_TRAFFIC = {False: "ladder-2", True: "ladder-lateral-1"}
 """Shipped library by whether cut-ins take time."""
-MOST_SURROGATES = 60
-"""Outcomes of a cut-in are bits of one integer."""
 
 
 def library_records(models: Sequence[Surrogate], see_onset: bool) -> RecordArray:
@@ -107,13 +105,9 @@ class Library(Section):
                 expected = f"one of the surrogates: {', '.join(self.surrogates)}"
                 mend = did_you_mean(name, list(self.surrogates)) or "Add it to surrogates, or name another."
                 raise broken_rule(key, f"'{name}'", expected, mend)
-        if self.boundary == self.envelope:
-            expected = "a driver that reacts: the envelope crashes nearly always, which says nothing"
-            mend = "Name the most careless driver that the vehicle can be expected to outdo."
-            raise broken_rule("boundary", f"'{self.boundary}', which is the envelope", expected, mend)
-        if (n := self.n_drivers) > MOST_SURROGATES:
+        if (n := self.n_drivers) > MOST_FOLLOWERS:
             mend = "Every shell costs tests: keep those that differ in crash rate by a quarter or more."
-            raise broken_rule("surrogates", f"{n} of them, with the references", f"at most {MOST_SURROGATES}", mend)
+            raise broken_rule("surrogates", f"{n} of them, with the references", f"at most {MOST_FOLLOWERS}", mend)
         return self
 
     @model_validator(mode="after")

@@ -10,10 +10,13 @@ import os
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from functools import cache
 from pathlib import Path
+from xml.etree import ElementTree
 from xml.sax.saxutils import quoteattr
 
 import numpy as np
+import sumo_data
 
 from harness.errors import CampaignError
 from harness.problems import did_you_mean
@@ -53,38 +56,21 @@ MODELS = (
     "BKerner", "Wiedemann", "W99", "ACC", "CACC",
 )  # fmt: skip
 
-_MODEL = (
-    "delta", "stepping", "adaptTime", "adaptFactor", "security", "estimation", "k", "phi",
-    "tmp1", "tmp2", "tmp3", "tmp4", "tmp5",
-    "cc1", "cc2", "cc3", "cc4", "cc5", "cc6", "cc7", "cc8", "cc9",
-    "tpreview", "tPersDrive", "treaction", "tPersEstimate", "ccoolness", "sigmaleader", "sigmagap", "sigmaerror",
-    "jerkmax", "epsilonacc", "taccmax", "Mflatness", "Mbegin", "maxvehpreview",
-    "speedControlGain", "gapClosingControlGainSpeed", "gapClosingControlGainSpace", "gapControlGainSpeed",
-    "gapControlGainSpace", "collisionAvoidanceGainSpeed", "collisionAvoidanceGainSpace", "collisionAvoidanceOverride",
-    "speedControlGainCACC", "gapClosingControlGainGap", "gapClosingControlGainGapDot", "gapControlGainGap",
-    "gapControlGainGapDot", "collisionAvoidanceGainGap", "collisionAvoidanceGainGapDot", "tauCACCToACC",
-    "speedControlMinGap",
-)  # fmt: skip
-ATTRIBUTES = (
-    "carFollowModel", "length", "minGap", "maxSpeed", "desiredMaxSpeed", "speedFactor", "speedDev", "accel", "decel",
-    "emergencyDecel", "apparentDecel", "maxAccelProfile", "desAccelProfile", "tau", "sigma", "sigmaStep",
-    "startupDelay", "actionStepLength", "collisionMinGapFactor", "applyDriverState", "vClass", "emissionClass", "color",
-    "width", "height", "mass", "impatience", "speedFactorPremature",
-    *_MODEL,
-    "laneChangeModel", "lcStrategic", "lcCooperative", "lcSpeedGain", "lcKeepRight", "lcOvertakeRight",
-    "lcSpeedGainRight", "lcOvertakeDeltaSpeedFactor", "lcAssertive", "lcLookaheadLeft", "lcSigma",
-)  # fmt: skip
-"""Those that can matter to a vehicle on a straight road. SUMO ignores names that it does not know without a word."""
-
 RECYCLABLE_MODELS = ("Krauss", "IDM", "ACC", "CACC")
 """Models measured to keep nothing of an episode for the next: bit-equal to a fresh simulation (tests/worlds)."""
 _RECYCLABLE_ATTRIBUTES = frozenset(
     {"carFollowModel", "length", "minGap", "maxSpeed", "desiredMaxSpeed", "speedFactor", "accel", "decel",
      "emergencyDecel", "apparentDecel", "tau", "delta", "stepping", "lcOvertakeRight", "vClass", "color",
      "emissionClass"}
-    | {name for name in _MODEL if "Gain" in name}
 )  # fmt: skip
 _RECYCLABLE_ONLY_AS: dict[str, float] = {"sigma": 0.0, "speedDev": 0.0, "actionStepLength": STEP_S}
+
+
+@cache
+def attributes_of_sumo() -> list[str]:
+    """Attributes of a vType, as SUMO's schema has them: SUMO ignores names that it does not know without a word."""
+    schema = ElementTree.parse(Path(sumo_data.__path__[0]) / "data/xsd/types/route.xsd")  # noqa: S314 - SUMO's own
+    return [each.get("name", "") for each in schema.iterfind(".//*[@name='vTypeBaseType']/{*}attribute")]
 
 
 def av_type(sumo: Mapping[str, str | float]) -> dict[str, str | float]:
@@ -93,10 +79,9 @@ def av_type(sumo: Mapping[str, str | float]) -> dict[str, str | float]:
     Refuses attributes and models that SUMO does not have, and lengths that the crash criterion does not know.
     """
     for name, value in sumo.items():
-        if name not in ATTRIBUTES:
-            mend = did_you_mean(name, ATTRIBUTES) or "SUMO's documentation of vType lists them."
-            expected = "an attribute of SUMO's vType that matters to a vehicle on a straight road"
-            raise _wrong(name, f"the unknown attribute '{name}'", expected, mend)
+        if name not in attributes_of_sumo():
+            mend = did_you_mean(name, attributes_of_sumo()) or "SUMO's documentation of vType lists them."
+            raise _wrong(name, f"the unknown attribute '{name}'", "an attribute of SUMO's vType", mend)
         if isinstance(value, bool) or str(value).lower().lstrip("+-") in ("nan", "inf", "infinity"):
             raise _wrong(name, value, "a finite number or a text", "SUMO writes true and false as 1 and 0.")
     model = sumo.get("carFollowModel", DEFAULTS["carFollowModel"])
@@ -118,7 +103,9 @@ def recyclable(sumo: Mapping[str, str | float]) -> bool:
     if attributes["carFollowModel"] not in RECYCLABLE_MODELS:
         return False
     return all(
-        float(value) == _RECYCLABLE_ONLY_AS[name] if name in _RECYCLABLE_ONLY_AS else name in _RECYCLABLE_ATTRIBUTES
+        float(value) == _RECYCLABLE_ONLY_AS[name]
+        if name in _RECYCLABLE_ONLY_AS
+        else name in _RECYCLABLE_ATTRIBUTES or ("Gain" in name and name[:2] != "lc")
         for name, value in attributes.items()
     )
 

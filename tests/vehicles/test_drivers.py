@@ -266,7 +266,6 @@ SHIPPED = (SHIPPED_FOLDER / "ladder-2.yaml").read_text(encoding="utf-8")
     ("old", "new", "complaint"),
     [
         ("boundary: brakes-2-late-1s", "boundary: brakes-2-late", "Did you mean 'brakes-2-late-1s'"),
-        ("boundary: brakes-2-late-1s", "boundary: full-throttle-2", "which is the envelope"),
         ("envelope: full-throttle-2", "envelope: brakes-3", "expected constant"),
         ("envelope: full-throttle-2", "envelope: never-brakes", "less than"),
         ("delay_s: 0.7", "delay_s: 0.75", "multiple of the 0.1 s step"),
