@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
-from itertools import pairwise
 
 import click
 
@@ -21,26 +20,7 @@ from harness.errors import EXIT_DONE, HarnessError
 from harness.signals import interruptible, open_streams
 
 
-class _Commands(click.Group):
-    """Commands whose options do not take the name of the next one for their value."""
-
-    def resolve_command(
-        self, ctx: click.Context, args: list[str]
-    ) -> tuple[str | None, click.Command | None, list[str]]:
-        """The command that is asked for, and what is left of the call."""
-        name, command, rest = super().resolve_command(ctx, args)
-        options = [] if command is None else [each for each in command.params if isinstance(each, click.Option)]
-        known = {name: each.is_flag for each in options for name in each.opts}
-        for option, value in pairwise(rest):
-            if known.get(option) is False and (value in known or (option == "--set" and "=" not in value)):
-                of_command = click.Context(command or self, ctx, name)
-                without = "a value, before" if value in known else "'=', but"
-                raise click.BadOptionUsage(option, f"Option '{option}' without {without} {value}", of_command)
-        return name, command, rest
-
-
 @click.group(
-    cls=_Commands,
     epilog=examples(
         "harness run my_av.py:MyClass           # how often it crashes, with an interval",
         "harness run my.yaml --out runs/mine    # the same, in a campaign of your own",

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import re
 import textwrap
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import click
 
@@ -19,9 +17,6 @@ from harness.errors import HarnessError
 from harness.numbers import leaves, words
 from harness.processes import start_server
 from harness.vocabulary import FAMILIES, MOST_ASKED
-
-if TYPE_CHECKING:
-    from harness.campaign.campaign import Campaign
 
 
 @click.command(
@@ -139,21 +134,15 @@ def run(
     if limit and (own := harness.load_campaign(campaign_file, given, av=av).accept) is not None:
         asked = own.model_dump(exclude_defaults=True)
         say(f"note: --accept {accept} replaces the limit of {campaign_file}: {asked}", err=True)
-    with _told_as_typed(accept):
-        campaign = harness.load_campaign(campaign_file, [*given, *limit, *where], av=av)
+    campaign = harness.load_campaign(campaign_file, [*given, *limit, *where], av=av)
     if junit is not None and campaign.accept is None:
         say("note: without a limit (--accept) the JUnit file says only whether the run reached its end", err=True)
-    chosen = folder is None
     folder = folder or options.run_folder(campaign, resume=resume)
     if resume and not holds_tests(folder):
         say(f"note: nothing to resume in {folder}: starts anew", err=True)
-    elif resume:
-        _note_other_stop(folder, campaign)
-    elif chosen and folder.name != campaign.name and not ctx.meta.get("quiet"):
-        say(f"note: {options.RUNS / campaign.name} is there already: this run goes to {folder}", err=True)
     if campaign.run.executor == "local":
         start_server()
-    with _told_as_typed(accept), prints_kept_in(folder, chosen=chosen), progress_bar() as bar:
+    with prints_kept_in(folder), progress_bar() as bar:
         result = harness.run(campaign, folder, workers=workers, resume=resume, progress=bar)
     from harness.runner.underway import RunResult
 
@@ -165,31 +154,6 @@ def run(
         write_junit(junit, campaign.name, case, [result.report])
     print_either(content, [result], as_json=as_json)
     ctx.exit(result.exit_code)
-
-
-def _note_other_stop(folder: Path, campaign: Campaign) -> None:
-    """Say where a run that goes on is to end otherwise than was asked before."""
-    with suppress(HarnessError):  # a folder that cannot be gone on in is refused by the run
-        held = harness.load_campaign(folder / "campaign.yaml", check_files=False)
-        now, before = (dict(leaves(each.model_dump(include={"stop", "accept"}))) for each in (campaign, held))
-        for key in {**before, **now}:
-            if now.get(key) != before.get(key):
-                is_now, was = ("null" if of.get(key) is None else words(of[key]) for of in (now, before))
-                say(f"note: {key} is {is_now} now; before it was {was}", err=True)
-
-
-@contextmanager
-def _told_as_typed(limit: str | None) -> Iterator[None]:
-    """Let an error of what ``--accept`` has set name that, and what was meant by it."""
-    try:
-        yield
-    except HarnessError as error:
-        if limit is not None and re.match(r"(--set )?accept\.(times_reference|crash_rate_below)", error.where):
-            error.where = f"--accept {limit}"
-            if not re.fullmatch(r"-?[\d.e-]+|([\d.]+\*)?[A-Za-z][\w.-]*", limit):
-                error.found, error.expected = f"'{limit}'", "crashes per test, or a driver's by name"
-                error.mend = "Write --accept 3e-7, which is per test, or r157-cc or 0.5*r157-cc, also of the sum."
-        raise
 
 
 @click.command(
@@ -278,10 +242,10 @@ def compare(
         labels = vehicles if vehicles[0] != vehicles[1] else (vehicles[0], f"{vehicles[0]}, {name_b}")
     if junit is not None and margin is None:
         say("note: without --margin the JUnit file says only whether it came to an end, whichever is worse", err=True)
-    if chosen := folder is None:
+    if folder is None:
         folder = options.RUNS / f"{a.name}-{re.sub('[^A-Za-z0-9_.-]+', '-', name_b)}"
     rhw = a.stop.rhw if any(parse_override(each).path == ("stop", "rhw") for each in overrides) else None
-    with prints_kept_in(folder, chosen=chosen), progress_bar() as bar:
+    with prints_kept_in(folder), progress_bar() as bar:
         found = harness.compare(
             a, b, folder, workers=workers, progress=bar, labels=labels, stored=stored, margin=margin, rhw=rhw
         )

@@ -157,27 +157,9 @@ def accepting(limit: str) -> list[str]:
 
 
 def run_folder(campaign: Campaign, *, resume: bool) -> Path:
-    """``runs/NAME``, or the first new ``runs/NAME-2``, ``-3``, …; to resume, the last that is most like it."""
+    """``runs/NAME``, or the first new ``runs/NAME-2``, ``-3``, …; to resume, the last that is there."""
     numbered = chain([RUNS / campaign.name], (RUNS / f"{campaign.name}-{number}" for number in count(2)))
     there = list(takewhile(Path.exists, numbered))
-    alike = [(_likeness(each, campaign), i) for i, each in enumerate(there) if resume]
-    if alike and any((best := max(alike))[0]):
-        return there[best[1]]
+    if resume and there:
+        return there[-1]
     return RUNS / (f"{campaign.name}-{len(there) + 1}" if there else campaign.name)
-
-
-def _likeness(folder: Path, campaign: Campaign) -> tuple[int, int]:
-    """How much of a campaign is that of the run in a folder, what ends it counted last; 0 of others' vehicles."""
-    from harness.campaign.files import load_campaign
-    from harness.records.folder import CAMPAIGN
-
-    try:
-        held = load_campaign(folder / CAMPAIGN, check_files=False)
-    except HarnessError:
-        return 0, 0
-    if sorted(held.scenarios or [held.scenario]) != sorted(campaign.scenarios or [campaign.scenario]):
-        return 0, 0
-    if held.av.identity() != campaign.av.identity():
-        return 0, 0
-    same = [key for key, value in campaign if getattr(held, key) == value]
-    return 1 + len({*same} - {"stop", "accept"}), len(same)

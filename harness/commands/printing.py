@@ -33,16 +33,14 @@ def say(*lines: object, err: bool = False) -> None:
 
 
 @contextmanager
-def prints_kept_in(folder: Path | None = None, *, chosen: bool = False) -> Iterator[None]:
+def prints_kept_in(folder: Path | None = None) -> Iterator[None]:
     """Let what is printed in workers be a file of the run folder, and say so; to stderr where nothing was run there.
 
-    Without a folder only how much it was is said. One that was ``chosen`` here is named where the work was not done.
+    Without a folder only how much it was is said.
     """
     began, before, Printed.kept, Printed.folder = time.time(), Printed.kept, (kept := Kept()), folder
-    done = False
     try:
         yield
-        done = True
     finally:
         Printed.kept = before
         with suppress(OSError):  # what ends the command is told first of all
@@ -56,8 +54,6 @@ def prints_kept_in(folder: Path | None = None, *, chosen: bool = False) -> Itera
                         file.write(kept.text)
                     told += f": {folder / PRINTED}"
                 say(told, f"  the first: {first[:80]}", err=True)
-        if chosen and not done and folder is not None and folder.exists():
-            say(f"Run folder: {folder}", err=True)
 
 
 def go_on_unread(stream: TextIO) -> None:
@@ -135,43 +131,20 @@ def usage_error(error: click.UsageError, context: click.Context) -> HarnessError
     """Put what click says of a wrong call into the words of all errors."""
     usage = " ".join(context.get_usage().removeprefix("Usage: ").split())
     mend, found = f"See `{context.command_path} --help`.", error.format_message().rstrip(".")
-    if isinstance(error, click.NoSuchOption) and (instead := _instead_of(error.option_name, context.command)):
-        found, mend = f"No such option '{error.option_name}'", instead
-    elif isinstance(error, click.BadOptionUsage) and (option := _option(context.command, error.option_name)):
-        mend = f"Write {error.option_name} {(option.metavar or option.type.name).upper().split()[0]}."
-    if "'export'" in found:  # which is like no command that exports
-        found, mend = found.partition(".")[0], "Write the motion of a test by `harness replay DIR TEST --out FILE.csv`."
+    if isinstance(error, click.NoSuchOption) and (setting := _setting_of(error.option_name, context.command)):
+        found, mend = f"No such option '{error.option_name}'", f"Write --set {setting}=…"
     return HarnessError(context.command_path, found, f"a call of the form: {usage}", mend)
 
 
-_INSTEAD = {
-    ("compare", "--resume"): "Leave it out: the same command with the same --out goes on.",
-    ("compare", "--exposure"): "Write --set exposure.lead_brakes=…",
-    ("compare", "--accept"): "Write --margin 0.1, by which B may be worse; `harness run` takes a limit.",
-}
-_PAGES, _ALSO_CALLED = ("--html", "--page", "--report"), {"tests": "episodes", "precision": "rhw"}
-
-
-def _instead_of(option: str, command: click.Command) -> str:
-    """What to write for an option that a command does not have; empty where nobody can tell."""
+def _setting_of(option: str, command: click.Command) -> str:
+    """The campaign's key that an unknown option is called like; empty if there is none, or no ``--set``."""
     from harness.campaign.campaign import Campaign
     from harness.campaign.models import places_of
 
-    if option in _PAGES:
-        return "Leave it out: the page is DIR/report.html, of every run."
-    names = (name for each in command.params for name in each.opts)
-    if meant := next((name for name in names if name[:2] == "--" and option.startswith(name)), None):
-        return f"Write {meant}."  # --scenarios, --output
     key = option.lstrip("-").replace("-", "_")
-    key = _ALSO_CALLED.get(key, key)
     places = (f"{each}.{key}".lstrip(".") for each in places_of(key, Campaign))
-    place = min(places, key=lambda at: at.count("."), default="")
-    written = f"Write --set {place}=…" if place and _option(command, "--set") else ""
-    return _INSTEAD.get((str(command.name), option), written)
-
-
-def _option(command: click.Command, name: str) -> click.Parameter | None:
-    return next((each for each in command.params if name in each.opts), None)
+    takes_settings = any("--set" in each.opts for each in command.params)
+    return min(places, key=lambda at: at.count("."), default="") if takes_settings else ""
 
 
 def print_json(content: Any) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from shutil import which
 from typing import Any
 
 import click
@@ -14,10 +13,8 @@ from harness.commands.options import FILE, FOLDER, RUN_FOLDER, examples, exposur
 from harness.commands.printing import print_either, print_estimates, print_json, print_table, say
 from harness.errors import EXIT_BAD_INPUT, HarnessError, WorldDisagreementError
 from harness.numbers import number, plain, share
-from harness.vocabulary import COMPARISON, ESTIMATORS, FAMILIES
+from harness.vocabulary import ESTIMATORS, FAMILIES
 
-LATERAL = ("lead_steps", "onset_step", "onset_gap_m", "onset_ttc_s", "overlap_ttc_s", "contact")
-"""What a replay tells of a cut-in that takes time."""
 LEAST_MOVE = 0.01
 """Of a rate or ratio that a line is worth."""
 
@@ -69,7 +66,6 @@ def estimate(
     of crashes in each shell is assumed to be the same. Traffic in which it cannot be is refused. Replicates of fitted
     traffic take a second each, so minutes for 200; they are kept, so that a second call takes seconds. The answer then
     says how far the rate may be off because the fit is uncertain; --write puts that into estimates.json and the page.
-    DIR may be the folder of a comparison, too.
     """
     several = exposures or counts or (folder / FAMILIES).is_file()
     if several and (estimators or environment is not None):
@@ -82,9 +78,6 @@ def estimate(
         require_place(folder)
     if several:
         _estimate_hours(folder, exposures, confidence, counts=counts, write=write, as_json=as_json)
-        return
-    if environment is not None and (folder / COMPARISON).is_file():
-        _compared_elsewhere(folder, environment, confidence, write=write, as_json=as_json)
         return
     if environment is not None:
         with progress_bar() as bar:
@@ -124,32 +117,6 @@ def _estimate_hours(
         write_sealed(folder / FAMILIES, content)
         page = write_hours(folder, content)
     print_either(content, hour_lines(content, page, readings=True), as_json=as_json)
-
-
-def _compared_elsewhere(
-    folder: Path, environment: str, confidence: float | None, *, write: bool, as_json: bool
-) -> None:
-    """What two vehicles' stored tests say of other traffic."""
-    if scenarios := sorted(folder.glob(f"*/{COMPARISON}")):
-        raise click.UsageError(f"--environment is for the folder of one scenario, such as {scenarios[0].parent}.")
-    if write:
-        raise click.UsageError("--write does not go with the folder of a comparison.")
-    with progress_bar() as bar:
-        from harness.runner.other_traffic import compare_in_other_traffic
-
-        content = compare_in_other_traffic(folder, environment, confidence=confidence, progress=bar)
-    if as_json:
-        print_json(content)
-    else:
-        from pydantic import TypeAdapter
-
-        from harness.estimators.traffic import TrafficError
-        from harness.report.rows import traffic_rows
-
-        traffic = content["traffic"]
-        rows = traffic_rows(TypeAdapter(TrafficError).validate_python(traffic))
-        told = [dict(zip(("what", "value", "interval", "remark"), row.texts, strict=True)) for row in rows]
-        print_table(f"A by {traffic['n_replicates']} replicates of {traffic['environment']}", told)
 
 
 def _ranges(_ctx: click.Context, _parameter: click.Parameter, texts: tuple[str, ...]) -> dict[str, tuple[float, float]]:
@@ -287,7 +254,6 @@ def replay(
     from harness.records.reader import code_of, hardest_crash, read_campaign
     from harness.report.motion import gui_program, watch, writer_of
     from harness.runner.stored import code_changed
-    from harness.worlds.sumo import sumo_program
 
     files = [*files, *([] if sumo_folder is None else [sumo_folder / "test.sumocfg"])]
     for file in files:  # can be written, before anything is simulated for them
@@ -304,7 +270,6 @@ def replay(
     written = [each for file in files for each in harness.write_motion(result, file)]
     content = {"folder": str(folder), "episode": episode, "outcome": result.outcome, "bit_equal": result.bit_equal}
     content |= {"files": [str(file) for file in written]}
-    content |= {name: result.row[name] for name in LATERAL if name in result.row}
     compared = {None: "no stored motion to compare with", True: "bit for bit as stored", False: "NOT as stored"}
     words = "the motion that the run has kept" if stored else compared[result.bit_equal]
     head, *facts = repr(result).splitlines()
@@ -312,11 +277,6 @@ def replay(
     print_either(content, [f"{head}; {words}", *facts, *written], as_json=as_json)
     if not stored and result.bit_equal is not False and (note := code_changed(manifest, campaign)):
         say(f"note: {note}", err=True)
-    if any(file.suffix == ".sumocfg" for file in written) and not which("sumo"):
-        try:
-            sumo_program("sumo", "--sumo")
-        except HarnessError as missing:  # what is written is of use elsewhere
-            say(f"note: {missing.found} on this machine to run it (extra 'sumo'). {missing.mend}", err=True)
     if program is not None:
         watch(result, program)
     if result.changed is not None:

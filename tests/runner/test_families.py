@@ -29,7 +29,7 @@ from harness.runner import other_traffic
 from harness.runner.compare import compare_campaigns
 from harness.runner.run import require_same_shares
 from harness.runner.stored import estimate_families
-from tests.in_process import one_process, run_here, run_with_workers, without_page
+from tests.in_process import one_process, run_here, run_with_workers
 from tests.stored_runs import copy_of
 
 NAMES = ("cut_in", "lead_brakes", "cut_out")
@@ -423,16 +423,6 @@ def test_who_does_not_look_moves_the_answer_of_the_sum_as_sensitivity_says(run, 
     (of_tests,) = other_traffic._of_one(run.folder / "cut_in", {}, Progress()).bars
     assert of_tests.rate[1] > 1.2 * bar.rate[1]
     assert of_tests.ratio == pytest.approx(bar.ratio, rel=1e-12)
-
-
-def test_a_run_that_goes_on_to_another_end_says_so(run, tmp_path, capsys):
-    folder = tmp_path / "run"
-    shutil.copytree(run.folder, folder)
-    given = [part for each in QUICK[1:] for part in ("--set", each)]
-    call = ["run", "idm", "--scenario", ",".join(NAMES), "--out", str(folder), "--resume", "--workers", "1", *given]
-    with one_process(), without_page():
-        assert main([*call, "--set", "stop.rhw=0.9"]) == 0
-    assert "note: stop.rhw is 0.9 now; before it was 0.6\n" in capsys.readouterr().err
 
 
 @pytest.mark.slow

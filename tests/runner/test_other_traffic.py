@@ -24,12 +24,10 @@ from harness.progress import Progress
 from harness.report.rows import bar_note
 from harness.resolved import resolve
 from harness.runner import other_traffic, stored_shells
-from harness.runner.compare import compare_campaigns
 from harness.runner.other_traffic import Move, bar_of, bar_of_readings, estimate_in_other_traffic, moves, sensitivity
 from harness.runner.stored_shells import Nearby, StoredShells
 from harness.strata import Reference
-from tests.golden.campaigns import COMPARED, LATERAL_FILE
-from tests.in_process import one_process, without_page
+from tests.golden.campaigns import LATERAL_FILE
 from tests.stored_runs import answer, copy_of, estimates, golden, manifest
 from tests.traffic.tables import TEXT, fitted
 from tests.traffic.tables import TEXT as SHIPPED
@@ -87,27 +85,6 @@ def test_the_folder_keeps_the_answer_of_its_own_traffic_alone(stored_run, tmp_pa
     (tmp_path / "mine.yaml").write_text(Path(mine).read_text().replace("{value: 0.01,", "{value: 0.02,"))
     assert main(["estimate", str(folder), "--environment", mine, "--write"]) == 2
     assert "with other numbers" in capsys.readouterr().err
-
-
-@pytest.mark.slow
-def test_the_ratio_of_two_vehicles_hardly_moves(tmp_path, capsys):
-    shared, other = COMPARED
-    with one_process(), without_page():
-        compare_campaigns(
-            golden("shells-twin", *shared), golden("shells-twin", *shared, other), tmp_path / "pair", workers=1
-        )
-    mine = fitted(tmp_path, **{LOOK: [0.005, 0.02]})
-    assert main(["estimate", str(tmp_path / "pair"), "--environment", mine, "--json"]) == 0
-    found = json.loads(capsys.readouterr().out)
-    compared = json.loads((tmp_path / "pair" / "compare.json").read_text())
-    assert found["traffic"]["rate"]["times"] == pytest.approx([0.5, 2.0], rel=0.01)
-    assert found["traffic"]["rate"]["value"] == pytest.approx(compared["a"]["crash_rate"])
-    of_both = found["traffic"]["ratios"]["B"]
-    assert of_both["times"] == pytest.approx([1.0 / (1.0 + ONE_LAW), 1.0 + ONE_LAW], rel=0.01)
-    assert of_both["value"] == pytest.approx(compared["ratio"])
-    assert of_both["sampling"] == pytest.approx([compared["ratio_low"], compared["ratio_high"]])
-    assert main(["estimate", str(tmp_path / "pair"), "--environment", mine, "--write"]) == 2
-    assert "--write does not go with" in capsys.readouterr().err
 
 
 def without_changes() -> str:
