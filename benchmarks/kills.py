@@ -49,7 +49,7 @@ def command(method: str, out: Path, episodes: int) -> list[str]:
 
 
 COMMANDS = {
-    "compare": "compare {scenario} --out {work} --against-av late-600ms --workers 2 --quiet --set world.engine=twin "
+    "compare": "compare {scenario} late-600ms --out {work} --workers 2 --quiet --set world.engine=twin "
     "--set stop.rhw=0.3",
     "pool": "pool {scenario} --set pool.relative_error=0.05",
     "estimate": "estimate {work} --write",

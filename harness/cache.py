@@ -22,7 +22,7 @@ from pathlib import Path
 import platformdirs
 
 from harness.errors import OF_THE_DISK, HarnessError
-from harness.files import checksum, read_bytes, write_atomically
+from harness.files import checksum, write_atomically
 
 FOLDER = "HARNESS_CACHE_DIR"
 """Environment variable that names the cache; the default is the user's own, if there is a home to have it in."""
@@ -95,7 +95,7 @@ def read(name: str) -> bytes | None:
     """What is kept under a name; None if nothing is, or it is damaged."""
     for path in places(name):
         with suppress(OSError):
-            content = read_bytes(path)
+            content = path.read_bytes()
             if zlib.crc32(content, zlib.crc32(name.encode())) == _SEALED:
                 _used(path)
                 return content[:-_SEAL_BYTES]

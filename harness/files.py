@@ -11,7 +11,6 @@ import zlib
 from collections.abc import Callable, Iterable
 from contextlib import suppress
 from pathlib import Path
-from typing import BinaryIO
 
 from harness.errors import writing
 
@@ -27,26 +26,9 @@ def real_path(path: Path | str) -> Path:
     return Path(os.path.realpath(path))
 
 
-def opened(path: Path) -> BinaryIO:
-    """A file to read; a pipe that nobody writes into is empty, and not waited for."""
-
-    def at_once(name: str, flags: int) -> int:
-        descriptor = os.open(name, flags | os.O_NONBLOCK)
-        os.set_blocking(descriptor, True)  # of one with a writer, as /dev/stdin, all is read
-        return descriptor
-
-    return open(path, "rb", opener=at_once)
-
-
-def read_bytes(path: Path) -> bytes:
-    """Content of a file, `opened`."""
-    with opened(path) as file:
-        return file.read()
-
-
 def checksum(path: Path, crc: int = 0) -> int:
     """CRC-32 of a file's bytes, and of what had ``crc`` before them."""
-    with opened(path) as file:
+    with path.open("rb") as file:
         while block := file.read(_BLOCK_BYTES):
             crc = zlib.crc32(block, crc)
     return crc

@@ -9,7 +9,6 @@ from __future__ import annotations
 import difflib
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from contextlib import suppress
 from pathlib import Path
 from typing import Any, get_args
 
@@ -71,7 +70,6 @@ def _parts(details: ErrorDetails, section: type[BaseModel]) -> dict[str, str]:
         expected, mend = f"one of the keys {', '.join(known)}", did_you_mean(last, known)
     elif kind == "model_type":
         expected = f"a section with keys such as {', '.join(list(section.model_fields)[:4])}"
-        mend = _as_section(value, section) or mend
     elif last == "[key]" and kind != "literal_error":
         found, expected, mend = f"the name {found}", _pattern_in_words(context), "Choose another name."
     elif kind == "literal_error":
@@ -84,26 +82,11 @@ def _parts(details: ErrorDetails, section: type[BaseModel]) -> dict[str, str]:
         unit = next((f" ({unit})" for suffix, unit in _UNITS.items() if last.endswith(suffix)), "")
         expected = KINDS.get(kind, details["msg"].removeprefix("Input should be ")) + unit
         expected += ", or null" if field and len(loc) == 1 and type(None) in get_args(field.annotation) else ""
-    if kind in ("list_type", "dict_type") and isinstance(value, str | int | float):
-        mend = f"[{value}]" if kind == "list_type" else f"{{NAME: {value}}}"
-    elif kind.startswith("less_than") and 0 in context.values():
+    if kind.startswith("less_than") and 0 in context.values():
         mend = f"Write {last}: -{value}."
     elif kind.startswith("less_than") and max(context.values()) <= 1.0 < value <= 100.0:
         mend = f"Write {last}: {value / 100.0:g} for {value:g} %."
     return {"key": key, "found": found, "expected": expected, "mend": mend}
-
-
-def _as_section(value: Any, section: type[BaseModel]) -> str:
-    """``{key: value}`` with the first key under which a section, or one within, takes the value; empty if none does."""
-    for key, field in section.model_fields.items():
-        with suppress(ValidationError):
-            section.model_validate({key: value})
-            return f"{{{key}: {value}}}"
-        for inner in (field.annotation, *get_args(field.annotation)):
-            is_section = isinstance(inner, type) and issubclass(inner, BaseModel)
-            if is_section and (text := _as_section(value, inner)):
-                return f"{{{key}: {text}}}"
-    return ""
 
 
 def _pattern_in_words(context: Mapping[str, Any]) -> str:

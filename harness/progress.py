@@ -30,9 +30,6 @@ class Progress:
     def stage(self, name: str, total: int | None, *, done: int = 0) -> None:
         """Begin a stage of ``total`` units (None: not known), ``done`` of which were finished by an earlier run."""
 
-    def tell(self) -> None:
-        """Tell a log of the stage at once: it may be long until something is finished."""
-
     def advance(self, n: int, **counts: int) -> None:  # noqa: ARG002 - for those who show it
         """Report ``n`` more units as finished, and what else is counted; KeyboardInterrupt if cancelled."""
         if self.cancelled:
@@ -89,11 +86,6 @@ class ShownProgress(Progress):
             self._bars.remove_task(task_id)
         self._bars.add_task(name, total=total, completed=done, before=done, figures={}, words="")
         if self._told or done:
-            self._print()
-
-    def tell(self) -> None:
-        """Unless that is done in any case."""
-        if not self._told and not self._stream.isatty():
             self._print()
 
     def advance(self, n: int, **counts: int) -> None:

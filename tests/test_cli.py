@@ -127,7 +127,7 @@ def test_what_is_no_option_or_has_no_value_is_told_with_what_to_write(asked, fix
         ("run --exposure lead_brakes=abc", "found:    abc, of lead_brakes"),
         ("run --scenario all --exposure leadbrakes=1", "fix:      Write --exposure lead_brakes=1."),
         ("run --set seed=2 --exposure cut_out=1", "Add --scenario all"),
-        *((f"compare --against-av idm --margin {wrong}", "margin") for wrong in ("1e308", "inf", "nan")),
+        *((f"compare idm --margin {wrong}", "margin") for wrong in ("1e308", "inf", "nan")),
     ],
 )
 def test_a_wrong_option_is_told_as_it_was_typed(asked, said, tmp_path, capsys):

@@ -50,11 +50,6 @@ def test_a_log_gets_a_line_now_and_then_and_none_of_what_is_quickly_done(monkeyp
         assert quick.getvalue() == ""
         lines.stage("tests", None, done=1_184)
     assert quick.getvalue().endswith("tests (1,184 kept): 1,184\n")
-    waiting = Log()
-    with ShownProgress(stream=waiting) as lines:
-        lines.stage("waiting for a pool", None)
-        lines.tell()
-    assert re.fullmatch(r"\d\d:\d\d:\d\d waiting for a pool\n", waiting.getvalue())
 
 
 @pytest.mark.parametrize(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated, Any, Literal, Self, get_args
 
-from pydantic import ConfigDict, Field, ValidationInfo, ValidatorFunctionWrapHandler, WrapValidator, model_validator
+from pydantic import Field, ValidationInfo, ValidatorFunctionWrapHandler, WrapValidator, model_validator
 from pydantic_core import PydanticKnownError
 
 from harness.campaign.sections import Positive, Probability, Section, StepTime
@@ -157,22 +157,6 @@ def _of_the_model(value: Any, _by_trial: ValidatorFunctionWrapHandler, info: Val
     return value
 
 
-def schema_by_model(schema: dict[str, Any]) -> None:
-    """Say in a JSON schema that parameters follow the model, the first of which is the IDM."""
-    properties = schema["properties"]
-    of_model, *_ = properties["model"].get("anyOf", [properties["model"]])
-    by_model = dict(zip(PARAMETERS, properties["parameters"].pop("anyOf"), strict=False))  # and any mapping
-    properties["parameters"]["type"] = "object"
-    schema["allOf"] = [
-        {
-            "if": {"required": ["model"], "properties": {"model": {"const": model}}},
-            "then": {"properties": {"parameters": parameters}},
-        }
-        for model, parameters in by_model.items()
-        if model in of_model["enum"]
-    ]
-
-
 Parameters = WrapValidator(_of_the_model, json_schema_input_type=BuiltInParameters | dict[str, Any])
 
 
@@ -189,8 +173,6 @@ class Reflexes(Section):
 
 class Surrogate(Section):
     """A stand-in for the unknown AV, with its reflexes; the shipped libraries have some."""
-
-    model_config = ConfigDict(json_schema_extra=schema_by_model)
 
     model: ModelName = Field(description="driver model")
     parameters: Annotated[BuiltInParameters, Parameters] = Field(default_factory=dict, validate_default=True)

@@ -42,8 +42,6 @@ def validated(data: dict[str, Any], model: type[Model], place: Places) -> Model:
                 places = dict.fromkeys(each or "the top level" for each in places_of(str(where[-1]), model))
                 belongs = f"'{where[-1]}' belongs under {' or '.join(places)}."
                 mend = belongs if places else "Delete it, or correct its name."
-            elif mend[0] in "{[":  # what to write
-                mend = f"Write {where[-1]}: {mend.replace('[all]', '[cut_in, lead_brakes, cut_out]')}."
             problems[where, found] = CampaignError(place(where), found, expected, mend)
     first, *more = problems.values()
     if not more:

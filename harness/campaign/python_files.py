@@ -16,8 +16,6 @@ from pathlib import Path
 from sysconfig import get_path
 from types import CodeType
 
-from harness.files import opened
-
 TRACI_MODULES = "traci", "libsumo", "libtraci"
 NOT_THE_USERS = str(Path(__file__).parents[1]), get_path("stdlib"), get_path("platstdlib")
 """Where the harness itself lies, and Python."""
@@ -34,7 +32,7 @@ def _parsed(name: str) -> ast.Module | None:
     file = Path(name)
     if file.suffix != ".py" or not file.is_file():
         return None
-    with suppress(SyntaxError, ValueError), opened(file) as source:
+    with suppress(SyntaxError, ValueError), file.open("rb") as source:
         return ast.parse(source.read())  # which knows of other encodings, as Python does
     return ast.Module([], [])
 

@@ -262,15 +262,6 @@ class Accept(Section):
             return "times_reference", beside.at_most, beside.driver
         return "crash_rate_below", self.crash_rate_below or math.nan, None
 
-    @model_validator(mode="before")
-    @classmethod
-    def _no_option(cls, data: Any) -> Any:
-        if isinstance(data, str) and "*" in data:  # as after --accept
-            times, _, driver = data.rpartition("*")
-            mend = f"{{times_reference: {{driver: {driver.strip()}, at_most: {times.strip()}}}}}"
-            raise broken_rule("", f"the text {data[:60]!r}", "a section", mend)
-        return data
-
     @model_validator(mode="after")
     def _one_limit(self) -> Self:
         if (self.crash_rate_below is None) == (self.times_reference is None):

@@ -6,12 +6,11 @@ import hashlib
 import re
 import shlex
 from pathlib import Path
-from string import Formatter
 from typing import Annotated, Any, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
+from pydantic import BaseModel, Field, field_validator, model_validator
 
-from harness.campaign.drivers import PARAMETERS, BuiltInParameters, ModelName, Parameters, Reaction, schema_by_model
+from harness.campaign.drivers import PARAMETERS, BuiltInParameters, ModelName, Parameters, Reaction
 from harness.campaign.sections import Positive, Section, StepTime, Whole
 from harness.problems import NAME_PATTERN, broken_rule, listed
 
@@ -66,13 +65,11 @@ class TraciProcess(Section):
     @classmethod
     def _command_can_be_filled_in(cls, command: str) -> str:
         try:
-            fields = [parts[1:] for parts in Formatter().parse(command) if parts[1] is not None]
-            wrong = [field for field in fields if field not in (("port", "", None), ("cells", "", None))]
-            problem = f"the field {wrong[0][0]!r}" if wrong else None if shlex.split(command) else "no word"
-        except ValueError as error:
-            problem = str(error)
+            problem = None if shlex.split(command.format(port=0, cells=0)) else "no word"
+        except (ValueError, LookupError, AttributeError) as error:
+            problem = f"{type(error).__name__}: {error}"
         if problem is not None:
-            expected = "a program and its arguments, with {port} and {cells} as they stand the only things in braces"
+            expected = "a program and its arguments, with {port} and {cells} the only things in braces"
             mend = "Double a brace that is meant as itself: {{ and }}."
             raise broken_rule("", f"{problem[:60]}, in {command[:200]!r}", expected, mend)
         return command
@@ -104,24 +101,8 @@ class FmuController(Section):
     start_values: dict[str, float] = Field(default_factory=dict, description="values set before initialisation")
 
 
-def _schema_of_sources(schema: dict[str, Any]) -> None:
-    """Say in a JSON schema that parameters follow the source of the AV, which is the IDM where none is named."""
-    schema_by_model(schema)
-    properties, of_idm = schema["properties"], schema["allOf"][0]["then"]
-    named: list[dict[str, Any]] = [{"required": [name]} for name in AV_SOURCES]
-    schema["oneOf"] = [{"not": {"anyOf": named}, **of_idm}]
-    for name in AV_SOURCES:
-        none = {"properties": {"parameters": {"maxProperties": 0}}} if name in READS_NO_PARAMETERS else {}
-        schema["oneOf"].append({"required": [name], **none})
-    for name in AV_SOURCES:  # null says "not this one": in a file of its own leaving the key out says it better
-        (source,) = (each for each in properties[name].pop("anyOf") if each.get("type") != "null")
-        properties[name] = source | {key: value for key, value in properties[name].items() if key != "default"}
-
-
 class AutomatedVehicle(Section):
     """The automated vehicle under test: one of model, controller, sumo, traci and fmu."""
-
-    model_config = ConfigDict(json_schema_extra=_schema_of_sources)
 
     model: ModelName | None = Field(None, description="built-in driver model, idm where nothing is named")
     controller: str | None = Field(
@@ -188,10 +169,6 @@ class AutomatedVehicle(Section):
     @model_validator(mode="before")
     @classmethod
     def _idm_when_nothing_is_named(cls, data: Any) -> Any:
-        if isinstance(data, str) and (data.endswith(".fmu") or data.startswith("sumo:")):  # as after --av
-            mend = f"{{fmu: {{file: {data}}}}}"
-            mend = f"{{sumo: {{carFollowModel: {data[5:]}}}}}" if data.startswith("sumo:") else mend
-            raise broken_rule("", f"the text {data[:60]!r}", "a section with keys such as fmu, sumo", mend)
         if not isinstance(data, dict) or any(data.get(name) is not None for name in AV_SOURCES):
             return data
         if forgotten := [name for name in AV_SOURCES if name in data]:

@@ -22,7 +22,6 @@ from yaml.nodes import MappingNode, Node, ScalarNode, SequenceNode
 from yaml.reader import ReaderError
 
 from harness.errors import CampaignError
-from harness.files import opened
 from harness.problems import did_you_mean
 
 YamlPath = Sequence[str | int]
@@ -76,7 +75,7 @@ def parse_value(text: str, where: str) -> Any:
 def read_text(path: Path) -> str:
     """Text of a UTF-8 file of no more than `LARGEST_FILE` bytes; else a `CampaignError`."""
     try:
-        with opened(path) as file:
+        with path.open("rb") as file:
             content = file.read(LARGEST_FILE + 1)  # not all of what may be a device without an end
         if len(content) <= LARGEST_FILE:
             return content.decode("utf-8-sig")

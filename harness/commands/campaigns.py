@@ -161,7 +161,7 @@ def run(
     epilog=examples(
         "harness compare old_av.py:MyClass new_av.py:MyClass --out runs/old_new",
         "harness compare runs/old new.yaml --margin 0.1 --out runs/old_new       # is the new one 10 % worse?",
-        "harness compare scenarios/smoke.yaml --av idm --against-av late-600ms --out runs/late",
+        "harness compare scenarios/smoke.yaml late-600ms --av idm --out runs/late",
     ),
 )
 @click.argument("source_a", metavar="A", type=CAMPAIGN)
@@ -171,7 +171,6 @@ def run(
     "--against", multiple=True, metavar="A.B=C",
     help="Setting that differs in B; with it B may be left out. May be given several times.",
 )  # fmt: skip
-@click.option("--against-av", metavar="VEHICLE", help="Vehicle of B; with it B may be left out.")
 @click.option(
     "--margin", type=click.FloatRange(0.0, 1e6), metavar="R",
     help="Run until it is known whether B's crash rate is at most 1 + R times A's. Replaces the precision.",
@@ -190,7 +189,6 @@ def compare(
     folder: Path | None,
     *,
     against: Sequence[str],
-    against_av: str | None,
     margin: float | None,
     workers: int | None,
     junit: Path | None,
@@ -213,7 +211,7 @@ def compare(
 
     Exit code 5: B is worse than A by more than --margin; 4: tests or pool were used up before that was known.
     """
-    if file_b is None and not against and against_av is None:
+    if file_b is None and not against:
         mend = f"Write harness compare {source_a} OTHER_AV, or say with --against SETTING=VALUE how B differs."
         raise HarnessError("harness compare", f"{source_a} alone", "two vehicles, or campaigns", mend)
     from harness.campaign.files import names_a_campaign
@@ -229,14 +227,14 @@ def compare(
     a = harness.load_campaign(file_a, overrides, av=av)
     of_b = file_b or file_a
     if names_a_campaign(file_a) and not names_a_campaign(of_b):  # a vehicle, driven as A's campaign says
-        b = harness.load_campaign(file_a, [*overrides, *against], av=against_av or av or str(of_b))
+        b = harness.load_campaign(file_a, [*overrides, *against], av=str(of_b))
         b = b.model_copy(update={"name": harness.load_campaign(of_b).name})
     else:
-        b = harness.load_campaign(of_b, [*overrides, *against], av=against_av or av)
+        b = harness.load_campaign(of_b, [*overrides, *against], av=av)
     if stored is not None:  # how far it was run before says nothing about now
         a = a.model_copy(update={"stop": b.stop})
     vehicles = vehicle_words(a.av)[0], vehicle_words(b.av)[0]
-    name_b = ", ".join([*filter(None, [against_av]), *against]) if file_b is None else b.name
+    name_b = ", ".join(against) if file_b is None else b.name
     labels = (a.name, b.name) if a.name != b.name else (str(source_a), str(file_b))
     if vehicles[0] != vehicles[1] or file_b is None:
         labels = vehicles if vehicles[0] != vehicles[1] else (vehicles[0], f"{vehicles[0]}, {name_b}")

@@ -15,7 +15,6 @@ import yaml
 from harness.arguments import AtLeastTwo, checked
 from harness.errors import HarnessError, printable
 from harness.families import families
-from harness.files import read_bytes
 from harness.fitting.distinct import fingerprint, require_distinct
 from harness.fitting.protocol import Asked, Fitted, Fitter
 from harness.fitting.table import load_mapping, recordings
@@ -126,10 +125,7 @@ def _require_ours(out: Path, written: Mapping[Path, bytes], inputs: Sequence[Pat
 
 
 def _may_replace(path: Path, mark: bytes) -> bool:
-    try:
-        return mark in read_bytes(path)
-    except OSError:
-        return not os.path.lexists(path)
+    return mark in path.read_bytes() if path.is_file() else not os.path.lexists(path)
 
 
 def environment_text(head: Sequence[str], content: Mapping[str, Any]) -> str:

@@ -24,7 +24,6 @@ from pydantic import Field
 from harness.campaign.models import read_model, shipped_or_own
 from harness.campaign.sections import Section
 from harness.errors import TrajectoryError, printable
-from harness.files import opened
 from harness.fitting.recording import NAMES, NO_LENGTH, NUMBERS, UNITS, Recording, Unit, recording_of, require
 from harness.problems import did_you_mean, file_meant
 
@@ -293,7 +292,7 @@ def _from_highd(rows: pd.DataFrame, path: Path) -> pd.DataFrame:
 def _highd_meta(path: Path, columns: list[str]) -> pd.DataFrame:
     """Columns of one of highD's two files about a recording, as text."""
     try:
-        with opened(path) as file:
+        with path.open("rb") as file:
             return pd.read_csv(file, usecols=columns, dtype=str)
     except (ValueError, OSError) as error:
         mend = "highD has it beside the tracks: use the file as published."

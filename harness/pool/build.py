@@ -82,7 +82,6 @@ def campaign_pool(resolved: Resolved, progress: Progress | None = None, order: S
 
     def waits(who: str) -> None:
         progress.stage(f"waiting for a pool that another run builds ({who})", None)
-        progress.tell()
 
     with cache.made_once(pool_name(key), waits):
         if (cached := cached_pool(resolved, order)) is not None:
@@ -104,7 +103,6 @@ def build_pool(resolved: Resolved, key: str, progress: Progress | None = None, o
     aim = take_aim(resolved, progress)
     n = planned_number(aim, resolved.campaign.pool.relative_error or resolved.family.pool_error)
     progress.stage(f"pool of {resolved.family.words.events}", n)
-    progress.tell()
     paths = aim.enumerator.run(PILOT_PATHS, n, progress)
     places = np.array([names.index(name) for name in order], np.int64) if order else None
     return pool_of(resolved, paths, key, places)

@@ -21,7 +21,7 @@ import pyarrow.parquet as pq
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
 from harness.errors import MEND_PART, RunFolderError, shortened
-from harness.files import read_bytes, write_atomically
+from harness.files import write_atomically
 from harness.vocabulary import COMPARISON, FAMILIES, StoppedBy
 
 T = TypeVar("T")
@@ -152,7 +152,7 @@ def write_part(folder: Path, shards: Sequence[Tables], first: int, n: int) -> Pa
             path = f"{name}/{first:09d}-{first + n:09d}.parquet"
             content = parquet(concatenated(kept, folder))
             write_bytes(folder / path, content)
-            files[name] = File(path, sum(table.num_rows for table in kept), len(content), zlib.crc32(content))
+            files[name] = File(path, sum(table.num_rows for table in kept), zlib.crc32(content))
     return Part(first, n, files)
 
 
@@ -169,7 +169,7 @@ def read_table(
 ) -> pa.Table:
     """Read one Parquet file of a run, opened once: what is decoded has the checksum ``crc32``, or its pages theirs."""
     try:
-        content = read_bytes(path)
+        content = path.read_bytes()
         require_sum(path, crc32, content, mend)
         # Faster than read_table by a millisecond.
         with pq.ParquetFile(pa.BufferReader(content), page_checksum_verification=crc32 is None) as file:
@@ -223,7 +223,6 @@ class File:
 
     path: TablePath
     n_rows: Count
-    n_bytes: Count
     crc32: Count | None = None
 
 
@@ -294,7 +293,7 @@ def read_as(kind: type[T], path: Path, *, mend: str) -> T:
     """Read a JSON file of a run as a type; one that no run has written is refused by the first value that is wrong."""
     expected = "a JSON file of a run"
     try:
-        content = read_bytes(path)
+        content = path.read_bytes()
         value = TypeAdapter(kind).validate_json(content, strict=True)
         values = json.loads(content)
     except (OSError, UnicodeDecodeError) as error:

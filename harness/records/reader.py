@@ -28,7 +28,7 @@ from harness.campaign.vehicle import AutomatedVehicle
 from harness.errors import CampaignError, RunFolderError
 from harness.families.numbers import ParameterFile
 from harness.families.protocol import Environment, Family
-from harness.files import content_hash, read_bytes
+from harness.files import content_hash
 from harness.processes import made_ahead
 from harness.records.folder import (
     CAMPAIGN,
@@ -64,7 +64,7 @@ def read_campaign(folder: Path, manifest: Mapping[str, Any], *, check_files: boo
         expected = "a campaign with all its sections, as the run has written it"
         raise RunFolderError(str(path), found, expected, mend) from error
     crc32 = manifest.get("campaign_crc32")
-    require_sum(path, crc32, read_bytes(path), mend)
+    require_sum(path, crc32, path.read_bytes(), mend)
     if crc32 is None:  # its run was killed as it began
         with suppress(CampaignError):  # its environment file is gone: nobody can tell
             require_campaign(path, resolve(campaign).content_hash, manifest)
@@ -109,14 +109,6 @@ def read_replicates(name: str, parameters: ParameterFile, shipped: Path) -> list
         raise RunFolderError(str(path), "replicates of another fit, or changed ones", expected, again)
     if of != parameters.content_hash().encode():
         raise RunFolderError(str(path), f"replicates of other numbers than those of {file.name}", expected, again)
-    wrong = [] if table.num_rows else ["no rows"]
-    for column, of in zip(table.column_names, table.columns, strict=True):
-        if column not in parameters.numbers():
-            wrong.append(f"column {column}")
-        elif of.null_count or not (pa.types.is_floating(of.type) or pa.types.is_integer(of.type)):
-            wrong.append(f"column {column} with something else than numbers")
-    if wrong:
-        raise RunFolderError(str(path), wrong[0], f"replicates of the numbers of {file.name}, by section__name", again)
     rows: list[dict[str, float]] = table.to_pylist()
     return rows
 
@@ -138,7 +130,7 @@ def code_of(av: AutomatedVehicle) -> str | None:
 
 def require_trust(folder: Path, manifest: Mapping[str, Any], code: str | None, mend: str) -> None:
     """Refuse (`RunFolderError`) to run ``code`` that a folder names which this user has not made on this machine."""
-    signed = signature(read_bytes(folder / CAMPAIGN))
+    signed = signature((folder / CAMPAIGN).read_bytes())
     if code is not None and (signed is None or not hmac.compare_digest(signed, str(manifest.get("signature")))):
         found = f"a run that was not made on this machine by this user; it names {code}, which would be run"
         raise RunFolderError(str(folder), found, "a run of your own, or your word for that code", mend)

@@ -27,7 +27,6 @@ from harness.estimators.pairs import PairDecision, Pairs, contrast, paired_estim
 from harness.estimators.per_hour import OfFamily, PerHour
 from harness.estimators.stopping import PairRule
 from harness.families import family_named
-from harness.files import read_bytes
 from harness.numbers import leaves, two_digits_up
 from harness.pool.shells import acceleration_limit
 from harness.progress import Progress
@@ -192,7 +191,7 @@ def _require_stored(stored: Path, folders: Sequence[str], campaign: Campaign) ->
         require_trust(stored / folder, read_manifest(stored / folder), code_of(campaign.av), mend)
     if (stored / FAMILIES).is_file():  # that of one scenario is known by its hash
         known = read_families(stored).get("campaign_crc32")
-        require_sum(stored / CAMPAIGN, known, read_bytes(stored / CAMPAIGN), MEND)
+        require_sum(stored / CAMPAIGN, known, (stored / CAMPAIGN).read_bytes(), MEND)
 
 
 def _written(

@@ -22,10 +22,9 @@ from harness.estimators.pairs import PairedShells, Pairs
 from harness.estimators.shells import SeenShells
 from harness.estimators.stopping import PairRule
 from harness.families.protocol import Exposure
-from harness.files import read_bytes
 from harness.pool.shells import Draw
 from harness.progress import Progress
-from harness.records.folder import read_manifest, sole_use, write_bytes
+from harness.records.folder import read_manifest
 from harness.resolved import Resolved
 from harness.runner.kept import Earlier, require_own_folder
 from harness.runner.run import exposure_of
@@ -151,14 +150,6 @@ def copy_stored(stored: Path, folder: Path, resolved: Resolved) -> None:
         raise RunFolderError(str(stored), f"a run of campaign {manifest['campaign_hash']}", expected, mend)
     require_own_folder(stored, resolved, resume=True)
     unfinished = folder.with_name(f".{folder.name}.part")
-    with sole_use(unfinished):  # in which a call that was killed may have left a part
-        try:
-            shutil.rmtree(unfinished / "a", ignore_errors=True)
-            copy = unfinished / "a"
-            for file in filter(Path.is_file, stored.rglob("*")):
-                write_bytes(copy / file.relative_to(stored), read_bytes(file))
-            if folder.exists():
-                folder.rmdir()
-            copy.replace(folder)
-        finally:
-            shutil.rmtree(unfinished)
+    shutil.rmtree(unfinished, ignore_errors=True)  # that of a call that was killed
+    shutil.copytree(stored, unfinished)
+    unfinished.replace(folder)

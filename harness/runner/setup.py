@@ -42,7 +42,6 @@ def compile_kernels(progress: Progress | None = None) -> bool:
         controller.write_text(_CONTROLLER)
         campaigns = [(f"{controller}:Holds", *_SMALL), ("idm", *_SHORT)]
         progress.stage("compiling, and building a pool of cut-ins", None)
-        progress.tell()
         beside = Child(tell, partial(_run_all, _OTHERS, Path(folder) / "others"))
         try:
             _run_all(campaigns, Path(folder))

@@ -1,7 +1,6 @@
 """Loading a campaign: every mistake is named with YAML path and line, several at once; --set and --av are laid over."""
 
 import json
-import os
 import pickle
 import re
 import shutil
@@ -39,14 +38,11 @@ MISTAKES = (
     ("av:\n  reaction: {delay: 0.5}", "av.reaction.delay", 3, "Did you mean 'delay_s'?"),  # its unit is left out
     ("epsilon: 0.2", "epsilon", 2, "belongs under testing"),
     ("testing: 5", "testing", 2, "a section with keys such as method"),
-    ("stop: 100", "stop", 2, "Write stop: {episodes: 100}."),
-    ("accept: r157-cc", "accept", 2, "Write accept: {times_reference: {driver: r157-cc}}."),
-    ("accept: 0.5*r157-cc", "accept", 2, "Write accept: {times_reference: {driver: r157-cc, at_most: 0.5}}."),
-    ("scenarios: all", "scenarios", 2, "Write scenarios: [cut_in, lead_brakes, cut_out]."),
-    ("exposure: 3", "exposure", 2, "Write exposure: {NAME: 3}."),
-    ("av: my_av.py:MyAV", "av", 2, "Write av: {controller: my_av.py:MyAV}."),
-    ("av: sumo:ACC", "av", 2, "Write av: {sumo: {carFollowModel: ACC}}."),
-    ("av: my_av.fmu", "av", 2, "Write av: {fmu: {file: my_av.fmu}}."),
+    ("stop: 100", "stop", 2, "a section with keys such as episodes"),
+    ("accept: r157-cc", "accept", 2, "a section with keys such as crash_rate_below"),
+    ("scenarios: all", "scenarios", 2, "a list"),
+    ("exposure: 3", "exposure", 2, "names, each with its value"),
+    ("av: my_av.py:MyAV", "av", 2, "a section with keys such as model, controller"),
     ("av:\n  limits: {max_braking_mps2: 8}", "av.limits.max_braking_mps2", 3, "Did you mean 'min_acceleration_mps2'?"),
     ("av:\n  limits: {min_acceleration_mps2: 8}", "av.limits.min_acceleration_mps2", 3, "min_acceleration_mps2: -8."),
     ("world:", "world", 2, "delete the key for its default"),
@@ -54,18 +50,18 @@ MISTAKES = (
     ("stop:\n  rhw: 1e-320", "stop.rhw", 3, "0.0001, or null"),
     ("stop:\n  confidence: 1e-16", "stop.confidence", 3, "0.01"),
     ("testing:\n  epsilon: 0", "testing.epsilon", 3, "what no surrogate crashes on would never be drawn"),
-    ("av:\n  model: fvdm\n  parameters: {time_headway_s: 1}", "av.parameters.time_headway_s", 4, "kappa_per_s"),
-    ("av:\n  parameters: {kappa_per_s: 1}", "av.parameters.kappa_per_s", 3, "surrogates.NAME.parameters"),
     ("surrogates:\n  A:\n    parameters: {}", "surrogates.A.model", 3, "no such key"),
     ("surrogates:\n  a.b: {model: idm}", "surrogates.a.b", 3, "another name"),
-    ("av:\n  model: idm\n  controller: a:B", "av", 2, "An AV has one driver"),
-    ("av:\n  controller:", "av.controller", 3, "Write a value after 'controller:'"),
     ("av:\n  controller: my module", "av.controller", 3, "text such as my_av.py:MyClass"),
     ("av:\n  sumo:\n    carFollowModel: ACC\n    minGap: true", "av.sumo.minGap", 5, "text or a number"),
     ("av:\n  traci: {command: ''}", "av.traci.command", 3, "starts the program"),
 )
 """Which an editor's schema refuses, too."""
 BROKEN_RULES = (
+    ("av:\n  model: fvdm\n  parameters: {time_headway_s: 1}", "av.parameters.time_headway_s", 4, "kappa_per_s"),
+    ("av:\n  parameters: {kappa_per_s: 1}", "av.parameters.kappa_per_s", 3, "surrogates.NAME.parameters"),
+    ("av:\n  model: idm\n  controller: a:B", "av", 2, "An AV has one driver"),
+    ("av:\n  controller:", "av.controller", 3, "Write a value after 'controller:'"),
     ("surrogates:\n  A: my.py:Model", "surrogates.A.controller", 3, "no file"),
     ("testing: {challenge: immediate}\nsurrogates: {A: my.py:Model}", "surrogates", 3, "one hold period"),
     ("testing: {method: episode_mixture}\nsurrogates: {}", "surrogates", 3, "at least one surrogate"),
@@ -278,7 +274,6 @@ def test_a_vehicle_is_a_campaign_by_the_recommended_method(vehicle, name, av, ow
     [
         ("my_av.py", "Name its class or function: my_av.py:MyAV or my_av.py:step"),
         ("my_aw.py:MyAV", r"^av\.controller \(my_aw.py:MyAV\): found no file \S*my_aw.py;.* Did you mean 'my_av.py'"),
-        ("pipe.py:MyAV", r"found no file \S*pipe.py;.* Correct the path"),
         ("mime.yaml", "no such file.* Did you mean 'mine.yaml'"),
         ("late-60ms", r"or one of late-600ms, [^;]{9,99} … \(\d+ names\).* Did you mean 'late-600ms'"),
         ("mine.yaml:idm", "format"),  # which is no panel
@@ -286,7 +281,6 @@ def test_a_vehicle_is_a_campaign_by_the_recommended_method(vehicle, name, av, ow
     ],
 )
 def test_what_is_neither_campaign_nor_vehicle_says_what_was_meant(given, said, own):
-    os.mkfifo("pipe.py")
     with pytest.raises(CampaignError, match=said) as caught:
         load_campaign(given)
     assert given.partition(":")[0] in f"{caught.value}"
@@ -336,7 +330,7 @@ def test_the_commands_take_a_vehicle(tmp_path, capsys, monkeypatch):
     seen = []
     monkeypatch.setattr("harness.runner.compare.compare_campaigns", lambda a, b, *_, **__: seen.extend([a, b]) or 1 / 0)
     with pytest.raises(ZeroDivisionError):
-        main(["compare", str(file), "--out", str(tmp_path / "c"), "--av", "idm", "--against-av", "SM-II", "--quiet"])
+        main(["compare", str(file), "SM-II", "--out", str(tmp_path / "c"), "--av", "idm", "--quiet"])
     assert [campaign.av for campaign in seen] == [AutomatedVehicle(), load_panel().avs["SM-II"]]
     assert main(["run", str(file), "--out", str(tmp_path / "r"), "--av", "nobody"]) == 2
     assert capsys.readouterr().err.startswith("error: --av nobody\n")

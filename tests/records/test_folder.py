@@ -232,9 +232,10 @@ def test_what_may_not_be_read_is_nothing_to_delete(name, stored, monkeypatch):
     def closed(path):
         if name in path.parts:
             raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(path))
-        return path.read_bytes()
+        return read(path)
 
-    monkeypatch.setattr("harness.records.folder.read_bytes", closed)
+    read = Path.read_bytes
+    monkeypatch.setattr(Path, "read_bytes", closed)
     with pytest.raises(RunFolderError, match=f"{name}.*Permission denied.* Change its permissions"):
         summarise(read_run_folder(stored)) if name == "estimates.json" else estimate_run(stored)
 

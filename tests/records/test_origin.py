@@ -114,7 +114,7 @@ def test_a_program_is_never_started_by_a_replay_whatever_the_manifest_says(store
 
 
 def test_a_stored_run_of_somebody_else_is_not_compared_with_unasked(made, elsewhere, capsys, tmp_path):
-    command = ["compare", str(elsewhere), "--against-av", "idm", "--out", str(tmp_path / "out")]
+    command = ["compare", str(elsewhere), "idm", "--out", str(tmp_path / "out")]
     assert main(command) == 2
     assert f"{elsewhere}/campaign.yaml" in capsys.readouterr().err
     assert not has_run(made)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 from collections import defaultdict
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -114,7 +113,6 @@ def test_what_makes_a_rate_doubtful_is_told_of_each_vehicle(done):
 
 def test_a_stored_run_of_a_is_taken_over(done, campaigns, tmp_path, driven):
     run_here(campaign(*SHELLS, "stop.rhw=0.9"), tmp_path / "stored")
-    os.mkfifo(tmp_path / "stored" / "pipe")  # is no file to be copied
     before = sum(driven)
     again = compare_campaigns(*campaigns, tmp_path / "out", workers=1, stored=tmp_path / "stored", rhw=0.15)
     assert again.content == done.content

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-
 import pyarrow.parquet as pq
 import pytest
 
@@ -145,10 +143,6 @@ def written(file: str, text: str | None):
     return lambda run: (run / file).unlink() if text is None else (run / file).write_text(text)
 
 
-def pipe(file: str):
-    return lambda run: ((run / file).unlink(), os.mkfifo(run / file))
-
-
 def rewritten(change):
     def damage(run):
         path = part_files(unnoted(run))[1]
@@ -181,8 +175,6 @@ POINT_WITHOUT_RATE = {"n": 1, "ci_low": 0, "ci_high": 1, "rhw": 1}  # which must
         (lambda run: truncate(run / "manifest.json"), READERS[:1], "manifest.json"),
         *((written("manifest.json", text), READERS[:1], "manifest.json") for text in (None, '{"parts": 5}')),
         *((written("campaign.yaml", text), READERS[:1], "campaign.yaml") for text in (None, "{}")),
-        *((pipe(file), READERS[:1], file) for file in ("manifest.json", "campaign.yaml", f"episodes/{SECOND}")),
-        (pipe("estimates.json"), READERS[1:2], "estimates.json"),  # nobody would ever write into it
         (written("plots", ""), READERS[1:2], "plots found: a file expected: a folder"),
         (rewritten(lambda table: table.slice(0, 70)), READERS[1:2], "found: 70 rows expected: 80 rows"),
         (rewritten(lambda table: table.drop_columns(["log_weight"])), READERS[1:2], "no column 'log_weight'"),

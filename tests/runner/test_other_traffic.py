@@ -152,15 +152,10 @@ def test_who_may_look_less_is_a_line_of_its_own(stored_run, tmp_path):
     assert assumed(tested.here, tested.pool, tested.design, Progress()) is None
 
 
-@pytest.mark.parametrize(
-    ("columns", "found"),
-    [({"cut_in__look": [0.1]}, "column cut_in__look"), ({LOOK: ["few"]}, "else than numbers"), (None, "no such file")],
-)
-def test_replicates_that_are_none_are_refused(stored_run, tmp_path, columns, found):
-    mine = fitted(tmp_path, **(columns or {}))
-    if columns is None:
-        (tmp_path / "replicates.parquet").unlink()
-    with pytest.raises(HarnessError, match=found):
+def test_replicates_that_are_gone_are_refused(stored_run, tmp_path):
+    mine = fitted(tmp_path)
+    (tmp_path / "replicates.parquet").unlink()
+    with pytest.raises(HarnessError, match="no such file"):
         estimate_in_other_traffic(stored_run("shells-twin"), mine)
 
 

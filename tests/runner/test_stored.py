@@ -209,8 +209,7 @@ def note(event, arguments):
     if event == "open" and opened and isinstance(arguments[0], str | os.PathLike):
         path, mode, flags = str(arguments[0]), arguments[1], arguments[2]
         [folder] = opened
-        # That of `harness.files.opened`, the opener of an open, has been counted with that.
-        reads = mode.startswith("r") if mode else not flags & (os.O_WRONLY | os.O_RDWR | os.O_NONBLOCK)
+        reads = mode.startswith("r") if mode else not flags & (os.O_WRONLY | os.O_RDWR)
         if reads and Path(path).is_relative_to(folder) and not path.endswith(".part") and not Path(path).is_dir():
             opened[folder][str(Path(path).relative_to(folder))] += 1
 
