@@ -9,7 +9,6 @@ import inspect
 import json
 import math
 import re
-import shutil
 import subprocess
 import sys
 from importlib.metadata import version
@@ -152,14 +151,6 @@ def test_what_is_stored_is_shown_in_ten_lines_too(call, first, map_below, stored
     if first == "idm · ":  # as the command line has it
         assert main(["estimate", str(stored_run(RUN))]) == 0
         assert capsys.readouterr().out == f"{found!r}\n"
-
-
-def test_a_run_without_an_answer_is_shown_all_the_same(stored_run, tmp_path):
-    folder = shutil.copytree(stored_run(RUN), tmp_path / "run")
-    (folder / "estimates.json").unlink()
-    found = harness.read(folder)
-    assert repr(found).endswith(" tests, without an answer as yet")
-    assert "<img" not in found._repr_html_()
 
 
 REFERENCE = json.loads((ROOT / "tests/reference/default.json").read_text(encoding="utf-8"))

@@ -12,7 +12,6 @@ from pathlib import Path
 import pytest
 
 from harness import cache
-from harness.cli import main
 from harness.errors import HarnessError, writing
 
 NAME, OTHER, CONTENT = "pools/one", "pools/other", bytes(range(256))
@@ -141,16 +140,6 @@ def test_a_full_disk_is_no_reason_to_go_elsewhere(spare):
     assert not spare.exists()
 
 
-def test_a_run_without_a_place_for_temporary_files_is_refused(tmp_path, monkeypatch, capsys):
-    def nowhere():
-        raise FileNotFoundError("No usable temporary directory found")
-
-    monkeypatch.setattr(tempfile, "gettempdir", nowhere)
-    assert main(["run", "idm", "--out", str(tmp_path / "run")]) == 2
-    assert "error: TMPDIR" in capsys.readouterr().err
-    assert not (tmp_path / "run").exists()
-
-
 def test_what_has_not_been_used_for_longest_makes_room(folder, monkeypatch):
     names = [f"tables/{i}" for i in range(4)]
     for i, name in enumerate(names[:3]):
@@ -191,13 +180,3 @@ def test_who_does_not_get_on_is_not_waited_for_longer_than_that(folder):
     with cache.made_once(NAME, waited.append), cache.made_once(NAME, waited.append, most_s=0.2):
         assert len(waited) == 1
     assert not list((folder / "pools").iterdir())
-
-
-def test_where_no_lock_can_be_had_nobody_waits(folder, monkeypatch):
-    folder.write_text("no folder")
-    (piped := folder.with_name("piped") / NAME).parent.mkdir(parents=True)
-    os.mkfifo(piped.with_name(f".{piped.name}.lock"))
-    for own in (folder, folder.with_name("piped"), None):  # or neither a home nor yet a folder in its place
-        monkeypatch.setattr(cache, "own_folder", lambda own=own: own)
-        with cache.made_once(NAME, lambda _: pytest.fail("waits")):
-            pass

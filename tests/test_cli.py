@@ -6,7 +6,6 @@ import os
 import signal
 import sys
 from contextlib import suppress
-from itertools import filterfalse
 from pathlib import Path
 from unittest.mock import Mock
 
@@ -17,14 +16,14 @@ from harness.campaign.campaign import Campaign
 from harness.campaign.files import load_campaign
 from harness.cli import main
 from harness.commands.options import run_folder
-from harness.commands.printing import print_table, say
+from harness.commands.printing import say
 from harness.errors import EXIT_REFUTED, RunFolderError, TooManyFailedError
 from harness.progress import Progress
 from harness.report.words import lines, short_answer
 from harness.vehicles.library import OF_TRAFFIC
 from tests.golden.campaigns import BASE, RUNS
 from tests.in_process import one_process, without_page
-from tests.stored_runs import ROOT, SCENARIOS, copy_of, estimates, golden, manifest, sets
+from tests.stored_runs import SCENARIOS, copy_of, estimates, golden, manifest, sets
 
 SMOKE = str(SCENARIOS / "smoke.yaml")
 
@@ -139,27 +138,6 @@ def test_a_wrong_option_is_told_as_it_was_typed(asked, said, tmp_path, capsys):
     assert not (tmp_path / "out").exists()
 
 
-@pytest.mark.parametrize(
-    ("arguments", "code"),
-    [
-        (["check", "{}.yaml"], 2),
-        (["check", SMOKE, "--set", "{}=1"], 2),
-        (["{}"], 2),
-        (["run", *CAMPAIGN, "--out", "an out", "--resume"], 0),
-        (["estimate", "an out"], 0),
-    ],
-)
-def test_names_move_no_cursor(folder, capsys, monkeypatch, arguments, code):
-    """Escape sequences, in seven and in eight bits, and names that are not UTF-8."""
-    monkeypatch.chdir(folder.parent)
-    name = "runs\x1b[31m\x9b2J" + "\udcff" * (code == 2)
-    folder.rename(name)
-    assert main([each.replace("an out", name).replace("{}", name) for each in arguments]) == code
-    shown = "".join(capsys.readouterr())
-    assert shown.isprintable() or set(filterfalse(str.isprintable, shown)) <= set("\n")
-    assert "[31m" in shown or arguments[0] == "estimate"
-
-
 @pytest.fixture
 def raising(monkeypatch, tmp_path):
     """Exit code of a command in a folder, while what it calls raises."""
@@ -197,14 +175,6 @@ def test_errors_that_can_be_mended_are_told_in_words_and_keep_their_exit_code(ra
     assert err.startswith("error: episodes/0.parquet\n") == (code != 130)
 
 
-def test_a_current_folder_that_is_gone_is_told(tmp_path, monkeypatch, capsys):
-    (tmp_path / "gone").mkdir()
-    monkeypatch.chdir(tmp_path / "gone")
-    (tmp_path / "gone").rmdir()
-    assert main(["check", "idm"]) == 2
-    assert capsys.readouterr().err.startswith("error: current folder\n  found:    that it has been removed\n")
-
-
 @pytest.mark.parametrize("then", [lambda: Progress().advance(1), Mock(side_effect=RunFolderError(*WRONG))])
 @pytest.mark.parametrize(("number", "code"), [("SIGHUP", 129), ("SIGINT", 130), ("SIGTERM", 143)])
 def test_what_a_signal_ends_has_its_exit_code_whatever_becomes_of_the_interruption(capsys, then, number, code):
@@ -223,23 +193,6 @@ def test_what_a_signal_ends_has_its_exit_code_whatever_becomes_of_the_interrupti
     assert err.startswith("Interrupted")
     assert len(err.splitlines()) == 1
     assert not Progress.cancelled
-
-
-@pytest.mark.parametrize(
-    ("n", "before", "told"),
-    [
-        (None, {}, "No test was finished: the same command begins anew."),
-        (0, {}, "No test was finished: the same command begins anew."),
-        (3, {}, "Finished tests are kept: the same command with --resume goes on."),
-        (0, {"shadow": {}}, "Finished tests are kept: the same command with --resume goes on."),
-    ],
-)
-def test_after_an_interruption_it_is_told_whether_anything_is_kept(raising, tmp_path, capsys, n, before, told):
-    if n is not None:
-        (tmp_path / "cut_in").mkdir()
-        (tmp_path / "cut_in" / "manifest.json").write_text(json.dumps({"n_episodes": n, "before": before}))
-    assert raising(KeyboardInterrupt(), "harness.runner.run.run_campaign", "run", SMOKE, "--out") == 130
-    assert f"Interrupted. {told}\n" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("defect", [OSError(errno.EBADF, "closed too early"), ZeroDivisionError()], ids=repr)
@@ -331,24 +284,6 @@ def test_what_resuming_does_not_find_is_noted(tmp_path, monkeypatch, capsys):
     assert "nothing to resume in" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize(
-    ("asked", "labels", "out"),
-    [
-        (["examples/idm.py:IDM", "sumo:ACC"], ("idm.py:IDM", "SUMO’s ACC"), "idm-IDM-sumo-ACC"),
-        (["examples/idm.py:IDM", "--against", "name=x"], ("idm.py:IDM", "idm.py:IDM, name=x"), "idm-IDM-name-x"),
-        (["idm", "late-600ms"], ("idm", "late-600ms"), "idm-late-600ms"),
-    ],
-)
-def test_a_comparison_names_vehicles_as_their_runs_do(asked, labels, out, monkeypatch):
-    monkeypatch.chdir(ROOT)
-    compare = Mock(side_effect=ZeroDivisionError)
-    monkeypatch.setattr("harness.compare", compare)
-    with pytest.raises(ZeroDivisionError):
-        main(["compare", *asked])
-    assert compare.call_args.kwargs["labels"] == labels
-    assert str(compare.call_args.args[2]).startswith(f"runs/{out}")
-
-
 @pytest.mark.parametrize(("asked", "at_most"), [("r157-cc", 1.0), ("0.5*r157-cc", 0.5)])
 def test_a_limit_by_hand_replaces_that_of_the_campaign_and_says_so(asked, at_most, tmp_path, monkeypatch, capsys):
     run = Mock(side_effect=ZeroDivisionError)
@@ -358,13 +293,6 @@ def test_a_limit_by_hand_replaces_that_of_the_campaign_and_says_so(asked, at_mos
         main(["run", "idm", "--out", str(tmp_path / "run"), "--set", own, "--accept", asked])
     assert run.call_args.args[0].accept.times_reference.at_most == at_most
     assert f"--accept {asked} replaces the limit of idm: {{'times_reference'" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize(("columns", "width"), [("60", 60), ("", 140)])
-def test_a_table_in_a_file_is_as_wide_as_columns_says(columns, width, monkeypatch, capsys):
-    monkeypatch.setenv("COLUMNS", columns)
-    print_table("Title", [{"what": "word " * 50}])
-    assert max(map(len, capsys.readouterr().out.splitlines())) == width
 
 
 def test_estimate_writes_only_when_asked(folder, capsys):

@@ -14,7 +14,6 @@ from harness.campaign.campaign import Campaign
 from harness.campaign.drivers import IDMParameters, Surrogate
 from harness.campaign.files import QUICK, load_campaign, load_panel, schema_text
 from harness.campaign.models import read_model
-from harness.campaign.python_files import files_imported, is_script
 from harness.campaign.vehicle import AutomatedVehicle
 from harness.cli import main
 from harness.errors import EXIT_BAD_INPUT, CampaignError
@@ -116,13 +115,6 @@ def test_all_mistakes_are_named_at_once(load):
         load("".join(f"key_{i}: 1\n" for i in range(1000)))
 
 
-def test_name_is_asked_for_and_explained(tmp_path):
-    for text, words in (("seed: 1", "no such key"), ("name: a b", "a name of letters, digits, _ . and -, without")):
-        (tmp_path / "c.yaml").write_text(text)
-        with pytest.raises(CampaignError, match=rf"^name \(.*c.yaml:1\): .*{words}"):
-            load_campaign(tmp_path / "c.yaml")
-
-
 def test_parameter_files_are_read_with_the_place_of_every_problem(tmp_path):
     text = (SHIPPED_FOLDER / "ndd-overtaking-1.yaml").read_text()
     text = text.replace("r2_min_m: {value: 20.0,", "r2_min_m: {value: '20',")
@@ -212,11 +204,6 @@ def test_errors_name_the_option(load, override):
     with pytest.raises(CampaignError) as caught:
         load("", override)
     assert f"--set {override}" in caught.value.where
-
-
-def test_rules_between_file_and_option_name_both(load):
-    with pytest.raises(CampaignError, match=r"bad.yaml:3.* --set testing.alpha.SM-I=0.9: found"):
-        load("testing:\n  alpha: {SM-I: 0.5, SM-II: 0.4, SM-III: 0.1}", "testing.alpha.SM-I=0.9")
 
 
 # -- the panel and --av --
@@ -334,12 +321,3 @@ def test_the_commands_take_a_vehicle(tmp_path, capsys, monkeypatch):
     assert [campaign.av for campaign in seen] == [AutomatedVehicle(), load_panel().avs["SM-II"]]
     assert main(["run", str(file), "--out", str(tmp_path / "r"), "--av", "nobody"]) == 2
     assert capsys.readouterr().err.startswith("error: --av nobody\n")
-
-
-def test_modules_of_any_size_and_encoding_are_read_as_python_does(tmp_path):
-    (tmp_path / "big.py").write_text(f"import latin\nTABLE = [{'0.1, ' * 30_000}]\n")
-    (tmp_path / "latin.py").write_bytes(b"# -*- coding: latin-1 -*-\nimport traci  # \xe9\n")
-    (tmp_path / "my_av.py").write_text("import big\n")
-    names = {file.name for file in files_imported(tmp_path / "my_av.py", tmp_path)}
-    assert names == {"my_av.py", "big.py", "latin.py"}
-    assert is_script(str(tmp_path / "latin.py"))

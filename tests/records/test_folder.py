@@ -8,9 +8,7 @@ import io
 import os
 import pickle
 import random
-import resource
 import shutil
-import signal
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -21,7 +19,7 @@ import pytest
 
 from harness.errors import HarnessError, RunFolderError
 from harness.files import write_atomically
-from harness.records.folder import parquet, write_json, write_part, write_together
+from harness.records.folder import parquet, write_json, write_together
 from harness.report.summary import read_run_folder, summarise
 from harness.runner.stored import estimate_run, replay_episode
 from harness.runner.tables import read
@@ -110,25 +108,6 @@ def test_what_a_killed_writer_has_left_goes_with_the_next_write(tmp_path):
         fcntl.flock(writer, fcntl.LOCK_EX)
         write_json(tmp_path / "file.json", {})
     assert files_below(tmp_path) == {"file.json", new.name, in_use.name, foreign.name}
-
-
-def test_a_real_limit_on_file_size_leaves_nothing(tmp_path, tables):
-    """The kernel itself refuses to write more than a kilobyte, as a full disk would."""
-    before, handler = resource.getrlimit(resource.RLIMIT_FSIZE), signal.getsignal(signal.SIGXFSZ)
-    signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (1024, before[1]))
-    try:
-        with pytest.raises(OSError, match=r"[Ff]ile too large") as raised:
-            write_part(tmp_path, [tables], 0, 240)
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, before)
-        signal.signal(signal.SIGXFSZ, handler)
-    assert files_below(tmp_path) == set()
-    name = "episodes/000000000-000000240.parquet"  # the kernel alone names no file
-    assert raised.value.filename == str(tmp_path / name)
-    sent = pickle.loads(pickle.dumps(raised.value))
-    assert (sent.errno, sent.filename) == (errno.EFBIG, raised.value.filename)  # also from a worker
-    assert set(write_part(tmp_path, [tables], 0, 240).files) == {"episodes", "moments", "traces"}
 
 
 # -- a bit that flips, or a file of another run, changes no number without a word --
@@ -225,19 +204,6 @@ def test_going_on_with_a_damaged_file_names_it_and_its_mend_works(table, stored,
     run_here(golden(NAME), stored, resume=True)
     assert unlike_columns(stored_run(NAME), stored) == []
     assert told(stored) == told(stored_run(NAME))
-
-
-@pytest.mark.parametrize("name", ["manifest.json", "estimates.json", "episodes"])
-def test_what_may_not_be_read_is_nothing_to_delete(name, stored, monkeypatch):
-    def closed(path):
-        if name in path.parts:
-            raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(path))
-        return read(path)
-
-    read = Path.read_bytes
-    monkeypatch.setattr(Path, "read_bytes", closed)
-    with pytest.raises(RunFolderError, match=f"{name}.*Permission denied.* Change its permissions"):
-        summarise(read_run_folder(stored)) if name == "estimates.json" else estimate_run(stored)
 
 
 @pytest.mark.parametrize("crc32", [True, False])

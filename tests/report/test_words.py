@@ -12,7 +12,7 @@ from harness.numbers import number, plain
 from harness.records.folder import read_manifest
 from harness.report.rows import decided, held_back
 from harness.report.summary import read_run_folder
-from harness.report.words import LINES, WIDTH, columns, few, lines, short_answer
+from harness.report.words import LINES, WIDTH, columns, lines, short_answer
 from harness.runner.stored import stored_blocks
 from tests.stored_runs import answer_in, estimates, golden
 
@@ -67,19 +67,6 @@ def test_without_a_crash_there_is_a_bound_and_nothing_about_impacts(stored_run):
     assert (rows["rate"].what, rows["rate"].interval) == ("crash rate > 50 m/s", "no crash seen")
     assert rows["rate"].value.startswith("< ")
     assert rows["rate"].remark.startswith("< ")
-
-
-@pytest.mark.parametrize(("name", "given"), [("shells-inside", True), ("shells-stops", False)])
-def test_what_ended_a_run_is_said_with_what_it_rests_on(name, given, stored_run):
-    """The row above it may be of another statement."""
-    assert said(read_run_folder(stored_run(name))).scope.endswith("given the library" if given else "precise enough")
-
-
-def test_a_precision_just_missed_is_told_with_the_digit_that_it_misses_by(stored_run):
-    run = read_run_folder(stored_run("shells-twin"))
-    best = replace(run.estimates.best, rhw=0.3029)
-    scope = said(run, best, golden("shells-twin", "stop.rhw=0.3"), stopped_by="episodes").scope
-    assert "at ± 30.3 % (asked: ± 30 %)" in scope
 
 
 @pytest.mark.parametrize(
@@ -198,8 +185,3 @@ def test_a_decision_without_an_upper_end_is_written_and_told(low, told):
     found = Decision(0.5, "assumption_free", 0.95, low, math.inf, 40, "r157-cc").to_json()
     assert (found["verdict"], found["high"], held_back(found)) == ("undecided", None, False)
     assert decided(found).remark == told
-
-
-def test_of_too_many_remarks_the_last_says_where_they_are():
-    assert few(["a", "b", "c"], 3) == ["a", "b", "c"]
-    assert few(["a", "b", "c"], 2) == ["a", "! 2 more warnings: see the report"]

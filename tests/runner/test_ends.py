@@ -27,7 +27,6 @@ from harness.errors import (
 )
 from harness.progress import Progress
 from harness.resolved import resolve
-from harness.runner import underway as running
 from harness.runner import workers
 from harness.runner.stored import write_report
 from harness.runner.workers import WorkerLostError
@@ -35,7 +34,7 @@ from harness.sampling.protocol import ShardRequest
 from tests.in_process import one_process, run_here, run_with_workers, workers_alive
 from tests.runner import bad_workers
 from tests.runner.conftest import MIXTURE_FILE, SHELLS, SMALL, TWIN, campaign
-from tests.stored_runs import answer_in, copy_of, estimates, golden, manifest, part_files, sets, unlike_columns
+from tests.stored_runs import answer_in, copy_of, estimates, manifest, part_files, sets, unlike_columns
 
 LOOSE, TIGHT = "stop.rhw=0.3", "stop.rhw=0.15"
 COMMON = (
@@ -88,7 +87,7 @@ def test_what_was_interrupted_before_any_test_begins_anew(tmp_path):
     asked = campaign(*COMMON, "stop.rhw=null", "stop.episodes=50")
     with pytest.raises(KeyboardInterrupt):
         run_here(asked, tmp_path / "run", progress=Interrupted())
-    assert manifest(tmp_path / "run")["n_episodes"] == 0
+    assert (manifest(tmp_path / "run")["status"], manifest(tmp_path / "run")["n_episodes"]) == ("interrupted", 0)
     run_here(asked, tmp_path / "run")
     with pytest.raises(RunFolderError, match="already begun"):
         run_here(asked, tmp_path / "run")
@@ -200,16 +199,6 @@ def test_a_disagreement_in_a_worker_ends_the_run_and_all_workers(tmp_path, monke
         run_with_workers(campaign(*TWIN), tmp_path, workers=2)
     assert manifest(tmp_path)["status"] == "interrupted"
     assert workers_alive() == []
-
-
-def test_one_that_is_interrupted_before_its_first_test_says_so(tmp_path, monkeypatch):
-    def interrupted(*_):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(running, "assumed", interrupted)
-    with pytest.raises(KeyboardInterrupt):
-        run_here(golden("shells-twin"), tmp_path)
-    assert manifest(tmp_path)["status"] == "interrupted"
 
 
 def test_a_full_disk_is_told_and_the_run_can_be_resumed(twin_run, tmp_path, monkeypatch, capsys):

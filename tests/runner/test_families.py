@@ -2,23 +2,18 @@
 
 from __future__ import annotations
 
-import html
 import json
 import re
-import shutil
-from pathlib import Path
 
 import pytest
 
 import harness
-from harness.campaign.files import dump_campaign
-from harness.campaign.sections import EXPOSURES
 from harness.cli import main
 from harness.errors import CampaignError, HarnessError, RunFolderError
 from harness.estimators.stopping import Decision
 from harness.estimators.traffic import Bar, Sensitivity
 from harness.families.words import EXCLUDED
-from harness.numbers import number, plain
+from harness.numbers import number
 from harness.pool import moved
 from harness.printed import PRINTED
 from harness.progress import Progress
@@ -27,7 +22,6 @@ from harness.report.several import hour_lines
 from harness.resolved import resolve
 from harness.runner import other_traffic
 from harness.runner.compare import compare_campaigns
-from harness.runner.run import require_same_shares
 from harness.runner.stored import estimate_families
 from tests.in_process import one_process, run_here, run_with_workers
 from tests.stored_runs import copy_of
@@ -88,13 +82,6 @@ def test_the_answer_is_the_sum_over_families_of_what_their_runs_say(run):
     assert read_manifest(run.folder / "lead_brakes")["distance_per_test_m"] is None
 
 
-@pytest.mark.slow
-def test_the_sum_is_shown_in_ten_lines_by_python_too(run):
-    for found in (run, estimate_families(run.folder)):
-        assert html.unescape(found._repr_html_()) == f"<pre>{found!r}</pre>"
-        assert len(repr(found).splitlines()) <= 10
-
-
 def test_workers_and_interruptions_change_no_bit(run, tmp_path):
     out = tmp_path / "run"
     stopped = run_with_workers(campaign("stop.rhw=2.0"), out, workers=2)
@@ -123,15 +110,6 @@ def test_what_would_allocate_other_tests_is_refused_before_one_is_run(run, other
     with pytest.raises(RunFolderError, match=told):
         harness.run(campaign("stop.rhw=0.5", *other), run.folder, resume=True)
     assert {file: file.read_bytes() for file in run.folder.rglob("*") if file.is_file()} == kept
-
-
-def test_no_estimate_is_offered_that_would_keep_an_exposure_taken_away(tmp_path):
-    (tmp_path / "campaign.yaml").write_text(dump_campaign(campaign("exposure.cut_out=0.01")))
-    require_same_shares(tmp_path, campaign("exposure.cut_out=0.01", "stop.rhw=0.5"))
-    with pytest.raises(
-        RunFolderError, match=r"cut_out=0\.01; expected exposure as shipped\. Repeat it, or choose another"
-    ):
-        require_same_shares(tmp_path, campaign())
 
 
 @pytest.mark.slow
@@ -168,19 +146,6 @@ def test_other_exposures_need_no_new_tests(run, capsys):
     assert "families.json" in capsys.readouterr().err
 
 
-def test_a_folder_of_runs_that_is_not_whole_is_told(run, tmp_path, capsys):
-    folder = shutil.copytree(run.folder, tmp_path / "run")
-    (folder / "families.json").rename(tmp_path / "families.json")
-    for command in (["estimate", str(folder)], ["replay", str(folder), "1"]):
-        assert main(command) == 2
-        assert f"such as {folder}/cut_in. If it is an unfinished run" in capsys.readouterr().err
-    (tmp_path / "families.json").rename(folder / "families.json")
-    for name in NAMES:
-        (folder / name / "manifest.json").unlink()
-    assert main(["replay", str(folder), "1"]) == 2
-    assert "no run folder" in capsys.readouterr().err
-
-
 @pytest.mark.slow
 def test_a_budget_that_leaves_a_scenario_without_tests_is_refused_and_may_be_raised(run, tmp_path):
     with pytest.raises(CampaignError, match=r"stop\.episodes: found 5, spent before a test of"):
@@ -212,12 +177,6 @@ def test_exposures_out_of_all_bounds_are_refused(wrong, run, capsys):
     assert f"found:    {wrong}, of cut_in" in capsys.readouterr().err
     with pytest.raises(HarnessError, match="exposure"):
         estimate_families(run.folder, {"cut_in": wrong})
-
-
-@pytest.mark.parametrize("end", EXPOSURES)
-def test_exposures_at_the_bounds_are_shown(end, run):
-    shown = hour_lines(estimate_families(run.folder, dict.fromkeys(NAMES, end), counts=True), None)
-    assert any(f"given: cut-in {plain(end)}" in line for line in shown)
 
 
 @pytest.mark.parametrize(
@@ -384,20 +343,6 @@ def test_each_scenario_may_have_a_file_of_its_own(tmp_path):
         campaign("environments={lead_brakes: ./none.yaml}")
     with pytest.raises(CampaignError, match="cut-out-1"):
         campaign("environments={cut_out: cut-out-7}")
-
-
-def test_a_folder_with_something_else_is_left_alone(tmp_path):
-    (tmp_path / "mine.txt").write_text("mine")
-    with pytest.raises(RunFolderError, match=r"mine\.txt"):
-        harness.run(campaign(), tmp_path)
-    assert [each.name for each in Path(tmp_path).iterdir()] == ["mine.txt"]
-
-
-def test_an_answer_of_another_version_is_refused(run, tmp_path, capsys):
-    older = {key: value for key, value in run.content.items() if key != "readings"}
-    write_sealed(tmp_path / "families.json", older)
-    assert main(["report", str(tmp_path)]) == 2
-    assert "no key readings" in capsys.readouterr().err
 
 
 @pytest.mark.slow

@@ -71,13 +71,6 @@ def test_a_folder_of_somebody_else(tmp_path, complaint_of):
         assert str(tmp_path) in complaint_of(*command)
 
 
-def test_a_folder_that_cannot_be_made(tmp_path, complaint_of, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "file").write_text("not a folder")
-    assert "found: a place where nothing can be written" in (said := complaint_of(*RUN, "file/deeper/run"))
-    assert "error: file/deeper/run" in said
-
-
 def test_two_processes_do_not_run_into_one_folder(stored, complaint_of, whole):
     with sole_use(stored):
         said = complaint_of(*RUN, stored, "--resume", "--set", "stop.episodes=320")

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import os
 import signal
-import sys
 import tempfile
 import threading
 import time
@@ -16,7 +15,7 @@ from pathlib import Path
 import pytest
 
 from benchmarks.kills import descendants, orphans, started_by
-from harness.errors import EXIT_TOO_MANY_FAILED, CampaignError, HarnessError
+from harness.errors import EXIT_TOO_MANY_FAILED, HarnessError
 from tests.in_process import run_here, run_with_workers, workers_alive
 from tests.runner.conftest import SHELLS, TWIN, campaign
 from tests.runner.test_shells_runs import FORCED, SHADOWS, of
@@ -129,20 +128,7 @@ def test_what_the_cluster_cannot_give(tmp_path, asked, said):
     assert asked.startswith("runtime_env") or not (tmp_path / "run/manifest.json").exists()
 
 
-def test_nobody_answers_at_the_address(tmp_path, monkeypatch):
-    monkeypatch.setattr(ray, "is_initialized", lambda: False)
-    with pytest.raises(HarnessError, match=r"run\.ray\.address: found 127\.0\.0\.1:9: .*refused"):
-        run_with_workers(campaign(*TWIN, ON_RAY, "run.ray.address='127.0.0.1:9'"), tmp_path / "run")
-
-
 def test_another_version_on_a_machine_is_refused(tmp_path, monkeypatch):
     monkeypatch.setattr(on_ray, "source_hash", lambda: "0123456789abcdef")
     with pytest.raises(HarnessError, match="a machine with sources of its kernels"):
-        run_with_workers(campaign(*TWIN, ON_RAY), tmp_path / "run")
-
-
-def test_without_the_package(tmp_path, monkeypatch):
-    monkeypatch.setitem(sys.modules, "ray", None)
-    monkeypatch.delitem(sys.modules, "harness.runner.ray")
-    with pytest.raises(CampaignError, match=r"pip install -c requirements.lock -e '\.\[ray\]'"):
         run_with_workers(campaign(*TWIN, ON_RAY), tmp_path / "run")

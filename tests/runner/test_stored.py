@@ -7,7 +7,6 @@ import os
 import re
 import shutil
 import sys
-import xml.etree.ElementTree as ET
 from collections import Counter
 from contextlib import contextmanager
 from pathlib import Path
@@ -144,28 +143,6 @@ def test_a_record_that_was_tampered_with_is_noticed(table, column, twin_run, tmp
     out, err = capsys.readouterr()
     assert "NOT as stored" in out
     assert f"test {episode} of" in err
-
-
-def test_floating_car_data_hold_the_episodes_motion(sumo_run, tmp_path):
-    folder = sumo_run
-    episode = stored_table(folder, "episodes")["outcome"].to_pylist().index("crash")
-    fcd = tmp_path / "a, b" / "c${HOME}.xml"
-    result = replay_episode(folder, episode)
-    harness.write_motion(result, fcd)
-    assert result.bit_equal is True
-    frames = ET.parse(fcd).getroot().findall("timestep")
-    n_steps = result.row["n_steps"]
-    seen = [
-        {v.get("id"): (float(v.get("pos")), float(v.get("speed")), v.get("lane")) for v in frame}
-        for frame in frames[-n_steps:]
-    ]
-    expected: list[dict] = [{} for _ in range(n_steps + 1)]
-    columns = (result.trace[name].to_pylist() for name in ("step", "vehicle", "x_m", "v_mps", "lane"))
-    for step, vehicle, x, v, lane in zip(*columns, strict=True):
-        expected[step][vehicle] = (x, v, f"cell0_{lane}")
-    for frame, motion in zip(seen, expected[1:], strict=True):
-        for vehicle, (x, v, lane) in motion.items():
-            assert frame[vehicle] == (x, v, lane)
 
 
 # -- what is stored of a test determines how it ends: without a world, by what replays and pages drive others with --
