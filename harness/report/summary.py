@@ -94,10 +94,8 @@ def typed(path: Path) -> str:
     The bare name stands for a folder that is not below it. An absolute path would say where somebody keeps their files
     to everybody whom the page is mailed to.
     """
-    here, resolved = Path.cwd(), path.resolve()
-    unlinked = Path(os.path.abspath(path))  # noqa: PTH100 - resolve() would leave by a link what was typed below `here`
-    below = (each.relative_to(here) for each in (unlinked, resolved) if each.is_relative_to(here))
-    return shlex.quote(next(below, Path(resolved.name)).as_posix())
+    here, whole = Path.cwd(), Path(os.path.abspath(path))  # noqa: PTH100 - resolve() would follow links
+    return shlex.quote(str(whole.relative_to(here)) if whole.is_relative_to(here) else whole.name)
 
 
 def read_run_folder(path: Path, told: dict[str, Any] | None = None) -> RunFolder:

@@ -22,6 +22,7 @@ from itertools import compress
 from pathlib import Path
 from types import ModuleType
 from typing import Any, ClassVar
+from weakref import finalize
 
 import numpy as np
 
@@ -193,8 +194,8 @@ class Shim:
 
     def __init__(self, library: ctypes.CDLL, handle: int, told: FloatArray, x: FloatArray, v: FloatArray) -> None:
         self.told, self.x, self.v, self.position, self.speed = told, x, v, np.zeros(x.size), np.zeros(x.size)
-        self._library = library
-        self._handle: int | None = handle
+        self._library, self._handle = library, handle
+        finalize(self, library.shim_close, handle)
         self._wanted = np.zeros_like(told)
         arrays = self._wanted, told, x, v, self.position, self.speed
         self._addresses = [array.ctypes.data for array in arrays]  # to ask for them takes longer than the call
@@ -219,12 +220,6 @@ class Shim:
 
     def _error(self) -> RuntimeError:
         return RuntimeError(self._library.shim_error(self._handle).decode())
-
-    def close(self) -> None:
-        """Forget the vehicles."""
-        if self._handle is not None:
-            self._library.shim_close(self._handle)
-            self._handle = None
 
 
 SPEED_CHECK_STEPS = 10
@@ -326,8 +321,6 @@ class SumoWorld(SumoCells):
         """End the simulation; a world that is closed already leaves alone what others have opened since."""
         if self._running:
             self._running = SumoWorld._open = False
-            if self._shim is not None:
-                self._shim.close()
             atexit.unregister(self.close)
             self._api.close()
 

@@ -119,10 +119,7 @@ def install(missing: Sequence[SystemLibrary], commands: Sequence[Sequence[str]])
         done = subprocess.run(  # noqa: S603 - our own words, and names from our own table
             command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, check=False
         )
-        lines = [line.strip() for line in done.stdout.splitlines() if line.strip()]
-        # The lines that say what went wrong: apt marks them, the cause first; others end with them.
-        marked = [line for line in lines if line.startswith(("E:", "W:"))]
-        said += marked[:_QUOTED] or (lines[-_QUOTED:] if done.returncode else [])
+        said += done.stdout.splitlines()[-_QUOTED:] if done.returncode else []
     if done.returncode:
         found = f"exit code {done.returncode}: {' | '.join(said)}"
         mend = f"See to what it says, or give your administrator the line for this system:\n{_install_lines(missing)}"

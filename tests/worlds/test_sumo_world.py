@@ -152,7 +152,6 @@ def test_vehicles_that_are_gone_are_an_error_and_those_of_another_simulation_are
             shim.step(V[:2])
     with pytest.raises(RuntimeError, match="LV0"):
         shim.find_vehicles()
-    shim.close()
     world.load_again()
     world.place(np.arange(2), X[:2], V[:2], LANES[:2])
     drive(world, steps=3)
