@@ -103,7 +103,7 @@ def vehicle_words(av: AutomatedVehicle, *, script: float | None = None) -> tuple
         name = f"SUMO’s {given.pop('carFollowModel', 'Krauss')}"
     elif script:  # SUMO would know its vehicle's type, whose numbers hold until the script sets others
         of_type = av.traci_style
-        given["type"] = f"accel {plain(of_type.accel_mps2)}, decel {plain(of_type.decel_mps2)} m/s²"
+        given["type"] = f"accel {plain(of_type.accel_mps2)}, decel {plain(of_type.decel_mps2)} m/s² at first"
         given |= {} if script == STEP_S else {"step": f"{plain(script)} s"}
     elif av.traci is not None:
         name = f"TraCI client {Path(av.traci.command.split()[0]).name}"

@@ -216,7 +216,7 @@ class Run:
             held, n = self.earlier.n_episodes, self.n_episodes
             found = f"{held:,} finished tests, of which the campaign as it is asked for now would keep {n:,}"
             expected = "a stop rule (stop.rhw, stop.episodes) that needs at least the tests that are there"
-            mend = "Repeat the earlier run's --set options or ask for more; `harness estimate` reads what is there."
+            mend = f"Ask for more, or repeat its --set options; `harness estimate {self.folder}` reads what is there."
             raise RunFolderError(str(self.folder), found, expected, mend)
 
     @property
