@@ -119,7 +119,9 @@ def sum_warnings(content: Mapping[str, Any]) -> Iterator[str]:
     yield from words.runs_warning(decision)
     for each in content["readings"]:
         if _side(each) != _side(content["beside"]):
-            yield f"beside {each['reference']}, another reading of UN R157, it is × {' ('.join(ratio_words(each))})"
+            found, interval = ratio_words(each)
+            found = f"{found} ({interval})" if each["ratio"] else interval.replace("0 to", "<")
+            yield f"beside {each['reference']}, another reading of UN R157, it is × {found or '–'}"
     for name, of in content["families"].items():
         told = list(words.warnings_of(name, {**of, "rate": of["rate_per_hour"]}, " per hour"))
         if (left := of.get("assumed")) and (found := AssumedOfRate(**left)).no_lower_limit:
@@ -145,7 +147,8 @@ def exposures(content: Mapping[str, Any]) -> str:
         told.setdefault(kind, []).append(f"{called(name)} {plain(float(format(found['per_hour'], '.2g')))}")
         if EXCLUDED in found["source"]:
             told[kind][-1] += f" ({EXCLUDED})"
-        if (left := of.get("assumed")) and (others := looking_words(moved := AssumedOfRate(**left))):
+        left = of["n_crashes"] and of.get("assumed")
+        if left and (others := looking_words(moved := AssumedOfRate(**left))):
             told[kind][-1] += f" (crashes × {number(moved.most, 2)} if {others})"
     parts = [f"{kind}: {', '.join(each)}" for kind, each in told.items()]
     return "events per hour of driving, " + "; ".join([*parts, "other assumed numbers: harness sensitivity"])
