@@ -300,6 +300,12 @@ def test_a_reading_of_the_regulation_that_turns_the_answer_is_said(run):
     for content, n in ((run.content, 0), (turned, 1)):
         assert " ".join(" ".join(hour_lines(content)).split()).count("another reading") == n
     assert said in " ".join(" ".join(hour_lines(turned)).split())
+    none = {"ratio": 0.0, "ratio_low": 0.0, "ratio_high": 1.021}
+    without = {**run.content, "beside": run.content["beside"] | none | {"ratio_high": 0.9}, "readings": [letter | none]}
+    without["families"] = {name: {**of, "n_crashes": 0} for name, of in run.content["families"].items()}
+    told = " ".join(" ".join(hour_lines(without)).split())
+    assert said.replace("0.53 (0.46 to 1.21)", "< 1.02") in told
+    assert ("(crashes × " in " ".join(hour_lines(run.content)), "(crashes × " in told) == (True, False)
 
 
 def test_what_the_vehicle_did_before_bv_came_is_said_as_in_the_answer_of_one_scenario(run):
