@@ -119,9 +119,9 @@ def sum_warnings(content: Mapping[str, Any]) -> Iterator[str]:
     yield from words.runs_warning(decision)
     for each in content["readings"]:
         if _side(each) != _side(content["beside"]):
-            found, interval = ratio_words(each)
-            found = f"{found} ({interval})" if each["ratio"] else interval.replace("0 to", "<")
-            yield f"beside {each['reference']}, another reading of UN R157, it is × {found or '–'}"
+            times, interval = ratio_words(each)
+            times = f"{times} ({interval})" if each["ratio"] else interval.replace("0 to", "<") or times
+            yield f"beside {each['reference']}, another reading of UN R157, it is × {times}"
     for name, of in content["families"].items():
         told = list(words.warnings_of(name, {**of, "rate": of["rate_per_hour"]}, " per hour"))
         if (left := of.get("assumed")) and (found := AssumedOfRate(**left)).no_lower_limit:
