@@ -23,7 +23,7 @@ import numpy as np
 
 from harness.campaign.python_files import NOT_THE_USERS
 from harness.campaign.vehicle import AutomatedVehicle, Limits
-from harness.controllers.process_state import CHANGED_MODES, FloatingPointModes, OtherModules
+from harness.controllers.process_state import CHANGED_MODES, FloatingPointModes, OtherModules, closed_to_files
 from harness.controllers.protocol import (
     BatchController,
     BatchObservation,
@@ -172,12 +172,15 @@ class Guard:
                 os._exit(0)
 
     def require_untouched(self) -> None:
-        """Refuse (`CampaignError`) a vehicle that has replaced what the harness calls."""
+        """Refuse (`CampaignError`) a vehicle that has replaced what the harness calls, or lets it open no file."""
         if replaced := self._others.restored():
             more = f" and {len(replaced) - 3} more" if len(replaced) > 3 else ""
             found = f"a vehicle that has replaced {', '.join(replaced[:3])}{more}, which the harness calls, too"
             mend = "Give your own function a name of its own, in your own module."
             raise CampaignError("av.controller", found, "modules of Python and numpy left as they are", mend)
+        if why := closed_to_files():
+            found, mend = f"a vehicle after which nobody can open a file ({why})", "Close what a step or a test opens."
+            raise CampaignError("av.controller", found, "files that are closed again", mend)
 
     def close(self, controllers: Iterable[Any]) -> None:
         """Close controllers; what they raise is nobody's concern: they have failed before, or the run is over."""

@@ -5,6 +5,7 @@ import math
 import os
 import pkgutil
 import random
+import resource
 import signal
 import socket
 import subprocess
@@ -240,6 +241,20 @@ class Replaces(IDM):
 
     def step(self, seen):
         self.replace("step" if seen.bv_overlaps else "warm-up")
+        return super().step(seen)
+
+
+class KeepsOpen(IDM):
+    """Closes no file, of which its process may open few."""
+
+    def __init__(self):
+        super().__init__()
+        resource.setrlimit(resource.RLIMIT_NOFILE, (200, resource.getrlimit(resource.RLIMIT_NOFILE)[1]))
+        self.files = []
+
+    def step(self, seen):
+        with suppress(OSError):
+            self.files.append(Path(os.devnull).open())  # noqa: SIM115 - what it is for
         return super().step(seen)
 
 

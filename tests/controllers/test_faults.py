@@ -284,6 +284,11 @@ def test_a_call_whose_time_is_over_at_once_has_failed_like_any_that_is_late(monk
     assert without_place(wrong) == "StepTimeoutError: no answer within 10 s (av.limits.step_time_s)"
 
 
+def test_one_after_which_no_file_can_be_opened_is_told_so(tmp_path, capsys):
+    assert _run(tmp_path, _of("KeepsOpen")) == EXIT_BAD_INPUT
+    assert "nobody can open a file (Too many open files)" in capsys.readouterr().err
+
+
 def test_what_is_loaded_is_loaded_once_a_process_and_shared_and_nothing_else_is(tmp_path):
     av = forced(f"av={_of('Learned', note=str(tmp_path / 'note'), braking=[1.0])}").av
     host = build_host(av, n_cells=3, seed=1)
