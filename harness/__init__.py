@@ -11,8 +11,8 @@ The same as the command line, in a few lines of Python::
     harness.replay("runs/smoke", 17).outcome
 """
 
-from importlib import import_module
 from importlib.metadata import version
+from pkgutil import resolve_name
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -35,20 +35,20 @@ __all__ = [
 ]  # fmt: skip
 
 _PLACES = {
-    "HarnessError": ("harness.errors", "HarnessError"),
-    "av_check": ("harness.runner.look", "check_av"),
-    "compare": ("harness.runner.compare", "compare_campaigns"),
-    "estimate": ("harness.runner.stored", "estimate_run"),
-    "estimate_families": ("harness.runner.stored", "estimate_families"),
-    "estimate_in_other_traffic": ("harness.runner.other_traffic", "estimate_in_other_traffic"),
-    "fit": ("harness.fitting.files", "fit_files"),
-    "load_campaign": ("harness.campaign.files", "load_campaign"),
-    "read": ("harness.runner.tables", "read"),
-    "replay": ("harness.runner.stored", "replay_episode"),
-    "run": ("harness.runner.run", "run_campaign"),
-    "sensitivity": ("harness.runner.other_traffic", "sensitivity"),
-    "write_motion": ("harness.report.motion", "write_motion"),
-    "write_report": ("harness.runner.stored", "write_report"),  # not "report", as that package is called
+    "HarnessError": "harness.errors:HarnessError",
+    "av_check": "harness.runner.look:check_av",
+    "compare": "harness.runner.compare:compare_campaigns",
+    "estimate": "harness.runner.stored:estimate_run",
+    "estimate_families": "harness.runner.stored:estimate_families",
+    "estimate_in_other_traffic": "harness.runner.other_traffic:estimate_in_other_traffic",
+    "fit": "harness.fitting.files:fit_files",
+    "load_campaign": "harness.campaign.files:load_campaign",
+    "read": "harness.runner.tables:read",
+    "replay": "harness.runner.stored:replay_episode",
+    "run": "harness.runner.run:run_campaign",
+    "sensitivity": "harness.runner.other_traffic:sensitivity",
+    "write_motion": "harness.report.motion:write_motion",
+    "write_report": "harness.runner.stored:write_report",  # not "report", as that package is called
 }
 """Where each name is; imported when it is asked for, so that ``import harness`` and ``harness --help`` are quick."""
 
@@ -58,8 +58,7 @@ def __getattr__(name: str) -> Any:
         return version("harness")
     if name not in _PLACES:
         raise AttributeError(f"module 'harness' has no attribute {name!r}")
-    module, attribute = _PLACES[name]
-    return getattr(import_module(module), attribute)
+    return resolve_name(_PLACES[name])
 
 
 def __dir__() -> list[str]:

@@ -5,8 +5,6 @@ A number of numpy's is taken as the plain one that it stands for. A path may be 
 
 from __future__ import annotations
 
-import errno
-import os
 import re
 from collections.abc import Callable
 from functools import cache, wraps
@@ -87,23 +85,13 @@ def _checked(where: str, value: Any, adapter: TypeAdapter[Any], is_path: bool) -
         mend = did_you_mean(first["input"], re.findall("'(.*?)'", expected)) or "Correct the argument."
         mend = f"Write [{plain!r}]." if first["type"] == "sequence_str" else mend
         raise HarnessError(where, describe_found(first["input"]), expected, mend) from None
-    if is_path and isinstance(found, str | Path) and (wrong := _no_name(str(found))):
-        raise HarnessError(where, wrong, "the name of a file or folder", "Correct the argument.")
+    if is_path and isinstance(found, str | Path) and (not str(found) or not _is_text(str(found))):
+        raise HarnessError(where, f"'{found}'", "the name of a file or folder, in UTF-8", "Correct the argument.")
     return found
 
 
-def _no_name(text: str) -> str:
-    """What keeps a text from being the name of a file or folder; empty if nothing does."""
-    if text.encode(errors="replace").decode() != text:
-        return f"a name with bytes that are no UTF-8 ({text})"
-    try:
-        os.stat(text)  # noqa: PTH116 - an empty path would be this folder
-    except ValueError:
-        return "a zero byte in a name"
-    except OSError as error:
-        refused = error.errno in (errno.ENAMETOOLONG, errno.ELOOP) or not text
-        return f"a name that the system refuses ({error.strerror}): '{text[:40]}'" if refused else ""
-    return ""
+def _is_text(name: str) -> bool:
+    return "\0" not in name and name.encode(errors="replace").decode() == name
 
 
 def _words(problem: ErrorDetails, *, is_path: bool) -> str:

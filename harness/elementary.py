@@ -17,7 +17,6 @@ from harness.vocabulary import FloatArray
 
 @compiled
 def _apply(which: int, values: FloatArray) -> None:
-    """Replace values (n,) by a function of them."""
     for i in range(values.size):
         x = values[i]
         if which == 0:

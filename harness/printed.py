@@ -7,7 +7,6 @@ import threading
 from contextlib import suppress
 from multiprocessing import Pipe
 from multiprocessing.connection import wait
-from pathlib import Path
 from typing import ClassVar
 
 PRINTED = "printed.txt"
@@ -38,8 +37,7 @@ class Printed:
     """
 
     kept: ClassVar[Kept | None] = None
-    folder: ClassVar[Path | None] = None
-    """By what begins meanwhile, and of which run folder that is."""
+    """By what begins meanwhile."""
 
     def __init__(self) -> None:
         self._to_others = _to_stderr if self.kept is None else self.kept.add

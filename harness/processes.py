@@ -147,29 +147,22 @@ class Child:
         self._process.join(seconds)
         self.kill()
 
-    def is_stopped(self) -> bool:
-        """Whether it has been told to do nothing until it is continued, which nobody will."""
-        with suppress(OSError):
-            return _stat(self._process.pid)[0] == "T"
-        return False
-
     def _died(self) -> int | None:
-        """Exit code of one that has ended its pipe; if it lives on without it, or is stopped, it is ended."""
+        """Exit code of one that has ended its pipe; if it lives on without it, it is ended."""
         self._process.join(_DYING_S)
-        lives, stopped = self._process.is_alive(), self.is_stopped()
-        exit_code = self.kill()
-        return -signal.SIGSTOP if stopped else CLOSED_PIPE_EXIT_CODE if lives else exit_code
+        lives, exit_code = self._process.is_alive(), self.kill()
+        return CLOSED_PIPE_EXIT_CODE if lives else exit_code
 
 
 _Child = TypeVar("_Child", bound=Child)
 
 
 def first_to_answer(children: Sequence[_Child]) -> _Child:
-    """Wait for one that has an answer, has died, or was stopped."""
+    """Wait for one that has an answer, or has died."""
     while True:
-        ready = wait([handle for child in children for handle in child.handles], _LOOK_S)
+        ready = wait([handle for child in children for handle in child.handles])
         for child in children:
-            if (not set(child.handles).isdisjoint(ready) or (not ready and child.is_stopped())) and child.hears():
+            if not set(child.handles).isdisjoint(ready) and child.hears():
                 return child
 
 
@@ -252,7 +245,6 @@ def _begin(
     target: Callable[..., None],
     arguments: tuple[Any, ...],
 ) -> None:
-    """Do what this process has been started for."""
     os.setsid()
     leave_signals_to_parent()
     signal.signal(signal.SIGCHLD, signal.SIG_DFL)  # where a parent ignores it, children leave no exit code

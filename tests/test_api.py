@@ -75,7 +75,7 @@ RUN = "shells-twin"
     ("call", "where", "said"),
     [
         (lambda _: harness.run(3, "out"), "harness.run(campaign=", "found 3; expected a campaign (harness.load"),
-        (lambda _: harness.run("idm", ""), "harness.run(out=", "a name that the system refuses"),
+        (lambda _: harness.run("idm", ""), "harness.run(out=", "the name of a file or folder"),
         (lambda _: harness.run("idm", "out", workers=0), "harness.run(workers=", "found 0; expected greater than"),
         (lambda _: harness.run("idm", "out", progress=print), "harness.run(progress=", "an instance of Progress"),
         (lambda _: harness.run("idm", "out", worker=2), "harness.run:", "Did you mean 'workers'?"),

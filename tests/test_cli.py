@@ -157,7 +157,7 @@ WRONG = "episodes/0.parquet", "half a file", "a whole one", "Delete it."
     [
         (RunFolderError(*WRONG), 2, "\n  found:    half a file\n  expected: a whole one\n  fix:      Delete it.\n"),
         (TooManyFailedError(*WRONG), 3, "half a file"),
-        (KeyboardInterrupt(), 130, "No test was finished"),
+        (KeyboardInterrupt(), 130, "the same command with --resume goes on"),
         (errno.ENOSPC, 2, "Free some space"),
         (errno.EDQUOT, 2, "--resume"),
         (errno.EACCES, 2, "permissions"),
@@ -285,14 +285,13 @@ def test_what_resuming_does_not_find_is_noted(tmp_path, monkeypatch, capsys):
 
 
 @pytest.mark.parametrize(("asked", "at_most"), [("r157-cc", 1.0), ("0.5*r157-cc", 0.5)])
-def test_a_limit_by_hand_replaces_that_of_the_campaign_and_says_so(asked, at_most, tmp_path, monkeypatch, capsys):
+def test_a_limit_by_hand_replaces_that_of_the_campaign(asked, at_most, tmp_path, monkeypatch):
     run = Mock(side_effect=ZeroDivisionError)
     monkeypatch.setattr("harness.run", run)
     own = "accept={times_reference: {driver: r157-cc, at_most: 0.1}}"
     with pytest.raises(ZeroDivisionError):
         main(["run", "idm", "--out", str(tmp_path / "run"), "--set", own, "--accept", asked])
     assert run.call_args.args[0].accept.times_reference.at_most == at_most
-    assert f"--accept {asked} replaces the limit of idm: {{'times_reference'" in capsys.readouterr().err
 
 
 def test_estimate_writes_only_when_asked(folder, capsys):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import json
 import os
 import re
@@ -191,9 +190,7 @@ def named_vehicle(text: str, option: str = "") -> dict[str, Any]:
     found = f"no vehicle '{name}' in {place}" if colon else f"no {'' if option else 'campaign file, and no '}vehicle"
     if text.endswith(".py") and not Path(text).exists():
         found, files = "no such file", [str(file) for file in Path().glob("*.py")]
-    few = difflib.get_close_matches(name, known, FEW_NAMES, cutoff=0.3) or known[:FEW_NAMES]
-    more = f" … ({len(known)} names)" if len(few) < len(known) else ""
-    expected = f"{'' if colon else _OTHER_FORMS}one of {', '.join(few)}{more}"
+    expected = f"{'' if colon else _OTHER_FORMS}one of {', '.join(known[:FEW_NAMES])}, …"
     mend = in_python_file(text) or did_you_mean(name, [*files, *known]) or f"Name one of them: {listed(known)}."
     raise CampaignError(f"{option}{text}", found, expected, mend)
 

@@ -131,9 +131,6 @@ def run(
         *seeds,
         *overrides,
     ]
-    if limit and (own := harness.load_campaign(campaign_file, given, av=av).accept) is not None:
-        asked = own.model_dump(exclude_defaults=True)
-        say(f"note: --accept {accept} replaces the limit of {campaign_file}: {asked}", err=True)
     campaign = harness.load_campaign(campaign_file, [*given, *limit, *where], av=av)
     if junit is not None and campaign.accept is None:
         say("note: without a limit (--accept) the JUnit file says only whether the run reached its end", err=True)

@@ -38,7 +38,7 @@ def prints_kept_in(folder: Path | None = None) -> Iterator[None]:
 
     Without a folder only how much it was is said.
     """
-    began, before, Printed.kept, Printed.folder = time.time(), Printed.kept, (kept := Kept()), folder
+    began, before, Printed.kept = time.time(), Printed.kept, (kept := Kept())
     try:
         yield
     finally:
@@ -83,11 +83,8 @@ _HOW_TO_GO_ON = {
 def show_interrupted(command: str, signal_name: str | None) -> None:
     """Say that the user or the system asked for the end, and that nothing finished is lost."""
     by = f" by {signal_name}" if signal_name not in (None, "SIGINT") else ""
-    how = _HOW_TO_GO_ON.get(command, "")
-    if how and not (Printed.folder and holds_tests(Printed.folder)):
-        how = " No test was finished: the same command begins anew."
     with suppress(OSError):  # after SIGHUP there may be no terminal left
-        click.echo(f"Interrupted{by}.{how}", err=True)
+        click.echo(f"Interrupted{by}.{_HOW_TO_GO_ON.get(command, '')}", err=True)
 
 
 def holds_tests(folder: Path) -> bool:

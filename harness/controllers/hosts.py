@@ -62,8 +62,6 @@ def death_cause(exit_code: int | None, limits: Limits) -> str:
         return f"{late}, and the call could not be interrupted"
     if exit_code == CLOSED_PIPE_EXIT_CODE:
         return "the controller closed file descriptors that are not its own (os.close, os.closerange)"
-    if exit_code == -signal.SIGSTOP:
-        return "the controller stopped its process (SIGSTOP)"
     return f"the controller ended the worker process (exit code {exit_code})"
 
 

@@ -206,7 +206,6 @@ def recording_of(name: str, file: str, rows: pd.DataFrame, share_read: float) ->
 
 
 def _rate_hz(recording: Recording, steps_s: FloatArray) -> float:
-    """Frames per second."""
     if not steps_s.size:
         raise TrajectoryError(recording.place, "one row per vehicle", "many", "Check the column vehicle_id.")
     step_s = float(np.median(steps_s))

@@ -109,7 +109,6 @@ def places(files: Sequence[Path]) -> str:
 
 @contextmanager
 def _reading(path: Path) -> Iterator[None]:
-    """Say what is wrong with a file that cannot be read."""
     expected = "a CSV or Parquet file"
     try:
         if path.exists() and not path.is_file():

@@ -217,7 +217,6 @@ class ShownTests:
 
 
 def _columns(family: Family, *, sees: bool) -> tuple[list[str], list[str]]:
-    """Columns of `ShownTests.rows` and of its crashes."""
     numbers = [each.name for each in family.columns if not each.length]
     in_time = [LEAD, "contact"] if sees else []
     return [*COLUMNS, *numbers, *in_time, "outcome"], [*path_columns(family), *in_time[:1], "outcome"]

@@ -158,7 +158,7 @@ def compare_campaigns(
                 each_ready.append(require_ready(whole.of_family(name) if whole.scenarios else whole, "compare"))
         of_a, of_b = each_ready
         require_comparable(of_a.campaign, of_b.campaign)
-        require_same_shells((of_a, of_b), stored)
+        require_same_shells((of_a, of_b))
         ready[out / folder] = of_a, of_b
     if stored is not None:
         for folder in folders.values():
@@ -282,21 +282,17 @@ def require_comparable(a: Campaign, b: Campaign) -> None:
         raise CampaignError(where, f"{of_a.get(where)} in A and {of_b.get(where)} in B{more}", expected, mend)
 
 
-def require_same_shells(sides: Both, stored: str | Path | None = None) -> None:
+def require_same_shells(sides: Both) -> None:
     """Refuse vehicles that would not have the same strata of events."""
     limits = [acceleration_limit(of_side.campaign.av) for of_side in sides]
     envelope = sides[0].library.envelope_mps2
     if (limits[0] > envelope) != (limits[1] > envelope):
         found = f"a hardest acceleration of {limits[0]:g} m/s² in A and {limits[1]:g} m/s² in B"
         expected = f"both up to {envelope:g} m/s², the envelope of the surrogate library, or both above"
-        av = sides[of_b := limits[1] > envelope].campaign.av
+        av = sides[limits[1] > envelope].campaign.av
         section = "limits" if av.model is None else "parameters"
         limit = f"av.{section}.max_acceleration_mps2={envelope:g}"
         mend = f"Add --set {limit}, which limits both (by default {Limits().max_acceleration_mps2:g})."
         if av.source == "sumo":
             mend = "Nothing in the harness limits what SUMO drives: compare it with another such vehicle."
-        elif stored is not None and of_b:
-            mend = f"Add --against {limit}, which limits B."
-        elif stored is not None:
-            mend = f"Name A's vehicle or campaign, not {stored}, so that it is run again with --set {limit}."
         raise CampaignError("av", found, expected, mend)

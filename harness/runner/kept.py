@@ -7,7 +7,6 @@ loses no more than that. What the manifest lists is there, and nothing else coun
 
 from __future__ import annotations
 
-import math
 import platform
 import re
 import time
@@ -290,11 +289,7 @@ def require_few_failed(
     """
     if causes.total() > (most := campaign.run.max_failed_share) * n:
         cause = "".join(f", {n_such} of them with: {why}" for why, n_such in by_kind(causes).most_common(1))
-        share = causes.total() / n
-        enough = min(math.ceil(2e3 * share) / 1e3, 1.0)  # with room, as further tests fail more often by chance
-        few = f"; or go on (`run`: --resume) with --set {SHARE}={enough:g}" if enough < 0.2 else ""  # [assumed]
-        few += ", where upper limits count them as crashes" if few else ""
-        mend = f"Fix the AV ({again}): a corrected one needs a new --out{few}."
+        mend = f"Fix the AV ({again}): a corrected one needs a new --out; or raise the share and go on with --resume."
         found, expected = f"{causes.total()} of {n} {what} failed{cause}", f"a share of at most {most:g}"
         if re.search(r"\b(nan|infinity|inf)\b", cause, re.IGNORECASE):
             mend = f"With nobody ahead gap_m is infinite and lead_speed_mps NaN (docs/controllers.md). {mend}"

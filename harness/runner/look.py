@@ -174,7 +174,6 @@ def _moved_by_warm_up(source: Source, n: int) -> dict[float, float]:
 
 
 def _first_answers(source: Source, av: AutomatedVehicle, n: int) -> dict[int, float]:
-    """Of tests that did not fail."""
     host = build_host(av, n_cells=1, seed=source.campaign.seed, names=source.scenario.shown)
     answers: Any = FirstAnswers(host) if host is not None else None
     world = TwinWorld(1, source.scenario.vehicles)

@@ -9,10 +9,7 @@ from __future__ import annotations
 
 import logging
 import os
-import signal
 import socket
-import sys
-import time
 from collections.abc import Mapping, Sequence
 from importlib import metadata
 from typing import Any
@@ -36,8 +33,6 @@ from harness.signals import handlers_restored
 LOCAL = "local"
 """Ray's word for a cluster of this machine alone, which ends with the run."""
 LOOK_S = 1.0
-PATIENCE_S = 30.0
-"""After this time without any worker the user is told what is waited for."""
 ANSWER_S = 10.0
 """Time in which a cluster has to answer."""
 STARTS = 3
@@ -168,7 +163,7 @@ class RayWorkers(Workers):
         self.ready: list[RayWorker] = []
         self._starting: list[RayWorker] = []
         self._here = this_machine(resolved, resolved.controller_sha256)
-        self._lost_at_start, self._patient_until = 0, time.monotonic() + PATIENCE_S
+        self._lost_at_start = 0
         self.baseline: list[ray.ObjectRef[bytes]] = []
         """Baseline runs, once they have all been made."""
         self._content = ray.put(resolved)
@@ -196,8 +191,7 @@ class RayWorkers(Workers):
     def first_to_answer(self, busy: Sequence[RayWorker]) -> RayWorker | None:
         pending = {worker.pending: worker for worker in [*busy, *self._starting]}
         while not (answered := ray.wait(list(pending), num_returns=1, timeout=LOOK_S)[0]):
-            if not busy and time.monotonic() > self._patient_until:
-                self._tell_of_waiting()
+            pass  # so that signals are handled
         worker = pending[answered[0]]
         if worker not in self._starting:
             return worker
@@ -206,7 +200,6 @@ class RayWorkers(Workers):
         return None
 
     def _admit(self, worker: RayWorker) -> None:
-        """Let a worker in that is ready, if it is one of ours."""
         try:
             made_of = worker.result()
         except RuntimeEnvSetupError as error:
@@ -226,15 +219,6 @@ class RayWorkers(Workers):
                 raise HarnessError("run.executor", f"a machine with {what} {there}", expected, mend)
         self._lost_at_start = 0
         self.ready.append(worker)
-
-    def _tell_of_waiting(self) -> None:
-        """Nothing is wrong yet: machines may come."""
-        self._patient_until = float("inf")
-        want, free, have = self._settings.resources, ray.available_resources(), ray.cluster_resources()
-        sys.stderr.write(
-            f"waiting for {want.cpus:g} CPUs and {want.gpus:g} GPUs of one machine; free are {_words(free)} of "
-            f"{_words(have)} in all\n"
-        )
 
     def close(self) -> None:
         super().close()
@@ -263,19 +247,14 @@ def _connect(address: str, environment: dict[str, Any] | None) -> None:
     """Begin to use a cluster; signals stay the harness's own."""
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
     ours: dict[str, Any] = {"include_dashboard": False} if address == LOCAL else {}
-    ended_by: int | None = None
     try:
         with handlers_restored():
             _require_answer(address)
             ray.init(address=address, logging_level=logging.ERROR, runtime_env=environment, **ours)
-    except SystemExit as error:  # Ray's own answer to SIGTERM, while it connects
-        ended_by = int(error.code or 0)
     except (RayError, OSError, RuntimeError, ValueError) as error:
         expected = "a Ray cluster of the same versions of Ray and Python, RAY_AUTH_MODE and RAY_AUTH_TOKEN"
         mend = "Start it with `ray start --head` and give its address, such as 10.0.0.1:6379, or none for this machine."
         raise HarnessError("run.ray.address", f"{address}: {error}", expected, mend) from error
-    if ended_by is not None:
-        signal.raise_signal(ended_by)
 
 
 def _require_answer(address: str) -> None:
@@ -286,7 +265,6 @@ def _require_answer(address: str) -> None:
 
 
 def _room(settings: RaySettings) -> int:
-    """How many workers the cluster has room for."""
     have, want = ray.cluster_resources(), settings.resources
     room = [have.get(name, 0.0) / n for name, n in (("CPU", want.cpus), ("GPU", want.gpus)) if n > 0.0]
     n = int(min(room, default=float(usable_cpus())))

@@ -216,7 +216,6 @@ def _result(campaign: Campaign, traffic: Environment | None, tables: Mapping[str
 def _simulated(
     folder: Path, manifest: dict[str, Any], campaign: Campaign, stored: Mapping[str, pa.Table], episode: int
 ) -> ReplayResult:
-    """The episode run again, and compared with what is stored."""
     resolved = resolve(campaign)
     require_campaign(folder / CAMPAIGN, resolved.content_hash, manifest)
     require_world(campaign)
@@ -229,7 +228,6 @@ def _simulated(
 
 
 def _replay(resolved: Resolved, folder: Path, episode: int, stored: pa.Table) -> dict[str, pa.Table]:
-    """Row and trace of the episode, run again."""
     source = prepare(resolved)
     if source.baseline_paths is not None:
         begin(source, partial(read_stored, folder, source.baseline_paths, read_manifest(folder)["before"]))

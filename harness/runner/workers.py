@@ -39,7 +39,7 @@ ATTEMPTS = 3
 SURELY_TOO_MANY = 1e-4
 """Probability of so many deaths under the allowed share, below which a controller is refused: with the default share
 its third at the earliest, its seventh if it dies in all of 96 cells, some ten seconds into the run."""
-SENT_FROM_OUTSIDE = (-signal.SIGKILL, -signal.SIGTERM, -signal.SIGSTOP, None)
+SENT_FROM_OUTSIDE = (-signal.SIGKILL, -signal.SIGTERM, None)
 """Ends that an operator or a shortage of memory brings: a controller is blamed only when its test is hit again."""
 CLOSING_S = 10.0
 """Time that a worker gets to release its controllers once all is done."""
@@ -216,7 +216,6 @@ class Workers:
                 worker.kill()  # it died while it was idle
 
     def _collect(self, waiting: deque[_Job]) -> None:
-        """Wait for one worker to finish its shard, or to die on it."""
         worker = self.first_to_answer(list(self._busy))
         if worker is None:
             return

@@ -96,7 +96,6 @@ FAULTS = {
     "ends_the_process": lambda: os._exit(7),
     "crashes": lambda: os.kill(os.getpid(), signal.SIGSEGV),
     "is_killed": lambda: os.kill(os.getpid(), signal.SIGKILL),
-    "stops": lambda: os.kill(os.getpid(), signal.SIGSTOP),
 }
 
 

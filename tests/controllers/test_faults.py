@@ -112,7 +112,6 @@ OF_THE_PROCESS = {
     "closes_descriptors": f"start: {CLOSED}",
     "crashes": "start: the controller ended the worker process (exit code -11)",
     "is_killed": "start: the controller ended the worker process (exit code -9)",
-    "stops": "start: the controller stopped its process (SIGSTOP)",
     "hangs_for_good": f"start: {LATE}, and the call could not be interrupted",
 }
 

@@ -243,14 +243,3 @@ def test_the_command_line_takes_a_run_folder(done, tmp_path, capsys):
     assert len(out.splitlines()) <= 9
     again = json.loads((tmp_path / "out" / "compare.json").read_text())
     assert again["shells"] == done.content["shells"]
-
-
-def test_a_run_that_nobody_limited_is_to_be_run_again(done, tmp_path):
-    """Which the folder of the comparison does not hinder: the run is not copied."""
-    early = "av={controller: 'tests.controllers.early:Speeds'}"
-    sides, stored = [campaign(*SHELLS, early), campaign(*SHELLS)], done.folder / "a"
-    with pytest.raises(CampaignError, match="so that it is run again"):
-        compare_campaigns(*sides, tmp_path / "out", stored=stored)
-    with pytest.raises(CampaignError, match=r"--against av\.limits\.max_acceleration_mps2=2, which limits B"):
-        compare_campaigns(*reversed(sides), tmp_path / "out", stored=stored)
-    assert not (tmp_path / "out").exists()
