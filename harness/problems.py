@@ -84,8 +84,6 @@ def _parts(details: ErrorDetails, section: type[BaseModel]) -> dict[str, str]:
         expected += ", or null" if field and len(loc) == 1 and type(None) in get_args(field.annotation) else ""
     if kind.startswith("less_than") and 0 in context.values():
         mend = f"Write {last}: -{value}."
-    elif kind.startswith("less_than") and max(context.values()) <= 1.0 < value <= 100.0:
-        mend = f"Write {last}: {value / 100.0:g} for {value:g} %."
     return {"key": key, "found": found, "expected": expected, "mend": mend}
 
 
@@ -99,22 +97,15 @@ def _how_to_mend(value: Any, kind: str, field: FieldInfo | None) -> str:
         return "Write a value after the colon, or delete the key for its default."
     if kind in _NUMBERS and isinstance(value, str) and re.fullmatch(r"[-+.\d_eE]*\d[-+.\d_eE]*", value):
         return "Remove the quotes."
-    if kind in _NUMBERS and isinstance(value, str) and re.fullmatch(r"\d+(\.\d+)? ?%", value):
-        return f"Write {float(value.rstrip(' %')) / 100.0:g}."
     if kind == "string_type" and isinstance(value, bool | int | float):
         return "Put it in quotes if it is meant as text."
     about = " ".join(field.description.split()) if field and field.description else ""
     return f"Correct it; the key means: {about.rstrip('.')}." if about else "Correct the value."
 
 
-_ALSO_CALLED = {"nade": "step_mixture", "vehicle": "av"}
-
-
 def did_you_mean(word: object, words: Sequence[str]) -> str:
     """The closest of some words, as a question; empty if none is close."""
     asked = str(word)[:_LONGEST]
-    if (known := _ALSO_CALLED.get(asked)) in words:
-        return f"{asked.upper()} is '{known}'."
     return f"Did you mean '{meant}'?" if (meant := nearest(asked, words)) else ""
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Callable
 from itertools import chain, count, takewhile
 from pathlib import Path
@@ -73,7 +72,7 @@ scenario_option = click.option(
 )  # fmt: skip
 
 
-def _exposures(_ctx: click.Context, _parameter: click.Parameter, texts: tuple[str, ...]) -> dict[str, float]:
+def _exposures(ctx: click.Context, parameter: click.Parameter, texts: tuple[str, ...]) -> dict[str, float]:
     """Events per hour by scenario, as ``--exposure`` has them."""
     from harness.campaign.sections import EXPOSURES
     from harness.families import family_named
@@ -81,16 +80,8 @@ def _exposures(_ctx: click.Context, _parameter: click.Parameter, texts: tuple[st
     found = {}
     for text in texts:
         name, _, value = text.partition("=")
-        family_named(name, option := f"--exposure {text}")
-        try:
-            found[name] = float(value)
-        except ValueError:
-            found[name] = math.nan
-        if not EXPOSURES[0] <= found[name] <= EXPOSURES[1]:
-            expected = "events per hour, from {:g} to {:g}".format(*EXPOSURES)
-            raise HarnessError(
-                option, f"{value or 'nothing'}, of {name}", expected, f"Write --exposure {name}=0.3, say."
-            )
+        family_named(name, f"--exposure {text}")
+        found[name] = click.FloatRange(*EXPOSURES)(value, parameter, ctx)
     return found
 
 

@@ -22,7 +22,7 @@ from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
 from harness.errors import MEND_PART, RunFolderError, shortened
 from harness.files import write_atomically
-from harness.vocabulary import COMPARISON, FAMILIES, StoppedBy
+from harness.vocabulary import StoppedBy
 
 T = TypeVar("T")
 Tables = dict[str, pa.Table]
@@ -278,12 +278,8 @@ def read_manifest(folder: Path, *, mend: str = NO_RUN) -> dict[str, Any]:
     if not path.exists():
         expected = "a run folder, which holds a manifest.json"
         if runs := sorted(folder.glob("*/" + MANIFEST)) or sorted(folder.glob("*/*/" + MANIFEST)):
-            several, mend = "a folder of several runs", f"Name one, such as {runs[0].parent}."
-            if (folder / FAMILIES).is_file():
-                several = "a run of several scenarios"
-            elif not (folder / COMPARISON).is_file():
-                mend += " If it is an unfinished run of several scenarios, `harness run` with --resume goes on."
-            raise RunFolderError(str(folder), several, "the run folder of one", mend)
+            mend = f"Name one, such as {runs[0].parent}. If it is not finished, `harness run` with --resume goes on."
+            raise RunFolderError(str(folder), "a folder of several runs", "the run folder of one", mend)
         raise RunFolderError(str(path), "no such file: this is no run folder", expected, mend)
     found = read_as(StoredManifest, path, mend=mend)
     return {**found.model_dump(exclude_unset=True), "parts": found.parts, "before": found.before}

@@ -6,7 +6,6 @@ Here workers are processes of this machine; `harness.runner.ray` makes those of 
 from __future__ import annotations
 
 import signal
-import sys
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
@@ -266,10 +265,7 @@ class LocalWorkers(Workers):
     """Processes of this machine, each started when it is first needed."""
 
     def __init__(self, resolved: Resolved, n_workers: int | None) -> None:
-        n_cpus = usable_cpus()
-        super().__init__(resolved, n_workers or n_cpus)
-        if self.n_workers > n_cpus:
-            sys.stderr.write(f"note: {self.n_workers} workers share the {n_cpus} CPUs that this process may use.\n")
+        super().__init__(resolved, n_workers or usable_cpus())
         start_server()
         self._resolved, self._baseline = resolved, SharedFile()
 

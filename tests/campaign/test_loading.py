@@ -31,8 +31,7 @@ def load(tmp_path):
 
 
 MISTAKES = (
-    ("stop: {rhw: 30 %}", "stop.rhw", 2, "Write 0.3."),
-    ("stop: {confidence: 95}", "stop.confidence", 2, "Write confidence: 0.95 for 95 %."),
+    ("stop: {confidence: 95}", "stop.confidence", 2, "less than or equal to"),
     ("testin:\n  epsilon: 0.2", "testin", 2, "Did you mean 'testing'?"),
     ("av:\n  reaction: {delay: 0.5}", "av.reaction.delay", 3, "Did you mean 'delay_s'?"),  # its unit is left out
     ("epsilon: 0.2", "epsilon", 2, "belongs under testing"),
