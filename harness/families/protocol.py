@@ -314,15 +314,6 @@ class Family(Protocol):
         """
         raise NotImplementedError
 
-    def avoidable(
-        self, traffic: Environment, facts: Mapping[str, FloatArray], where: FloatArray, drivers: RecordArray
-    ) -> BoolArray | None:
-        """Which drivers (D,) avoid a crash ``where`` (2, n) gap (m) and closing speed (m/s) at the event are so (n, D).
-
-        ``facts`` are of typical tests. None where these two do not decide it.
-        """
-        return None
-
 
 def _numbers_in(traffic: Any) -> bytes:
     """All numbers of a traffic: of parameters, or of a tuple, as kernels take it."""

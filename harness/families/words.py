@@ -22,7 +22,7 @@ class Words(NamedTuple):
     ``unlikely`` why probabilities of events do not add up to 1. ``shows`` and ``happens`` are a vehicle each and what
     it does at the onset and at the event; the same where they are one. ``tests`` says of which kind tests are, by
     whether events show themselves, and ``rests`` what a rate scales with, by the traffic (None where it is not known)
-    and the level of lane changing. ``limits`` explains the lines of a map.
+    and the level of lane changing.
     """
 
     called: str
@@ -40,7 +40,6 @@ class Words(NamedTuple):
     unlikely: str
     tests: Callable[[bool], str]
     rests: Callable[[Any, str], str]
-    limits: str = ""
 
 
 def words_of(*, event: str, of: str, **own: Any) -> Words:

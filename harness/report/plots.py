@@ -16,7 +16,6 @@ from harness.numbers import count, number, plain, share
 from harness.report.drawing import Plot, PlotAxis, PlotPanel
 from harness.report.summary import RunFolder, RunSummary, ShownShells, summarise
 from harness.strata import ASSUMPTION_FREE
-from harness.vehicles.library import library_records
 from harness.vocabulary import CRASH, FAILED, BoolArray, FloatArray, IntArray
 
 POOL = "pool’s own error"
@@ -213,22 +212,19 @@ def _open_question(found: ShownShells, names: tuple[str, ...], half_widths: list
 
 
 def where_plot(run: RunFolder, summary: RunSummary | None = None) -> Plot | None:
-    """Maps of the share of events that crash, over the family's axes, and what others avoid; None without any."""
+    """Maps of the share of events that crash, over the family's axes; None without any."""
     rows, family, words = (summary or summarise(run)).rows, run.family, run.family.words
     met = np.isfinite(rows["event_gap_m"]) & np.isfinite(rows["event_rate_mps"]) & (rows["outcome"] != FAILED)
     if not met.any():
         return None
     panels = [_map(axes, rows, met, words.events) for axes in family.maps]
-    lines = limits_of_others(run, rows, panels[0].y.high)
-    for (name, (speeds, gaps)), colour, dash in zip(lines.items(), ("ink", "blue"), ("", DASHED), strict=False):
-        panels[0].add("line", colour, gaps, speeds, dash=dash, label=f"{name}’s limit")
     x, y = (re.split(" (?:at|of|when) ", each.words)[0] for each in family.maps[0])  # without when
     n_crashes = count(int(np.count_nonzero(rows["outcome"][met] == CRASH)))
     text = (
         f"Each of {count(met.sum())} {words.events} by its {x} and {y}; {n_crashes} of them crashed. "
         "Where no cell is drawn, nothing was tested."
     )
-    return Plot("where", panels, text + words.limits * bool(lines), text + words.limits * bool(lines))
+    return Plot("where", panels, text, text)
 
 
 def _map(axes: tuple[Shown, Shown], rows: Mapping[str, FloatArray], met: BoolArray, events: str) -> PlotPanel:
@@ -256,24 +252,6 @@ def _map(axes: tuple[Shown, Shown], rows: Mapping[str, FloatArray], met: BoolArr
         label = f"≤ {share(high)}" if high else "tested, none"
         panel.add("boxes", colour, x[column], x[column + 1], y[row], y[row + 1], label=label)
     return panel
-
-
-def limits_of_others(
-    run: RunFolder, rows: Mapping[str, FloatArray], fastest_mps: float
-) -> dict[str, tuple[FloatArray, FloatArray]]:
-    """Closing speeds (m/s), and the smallest gap (m) at which each stand-in avoids a crash; none where unknown."""
-    family = run.family
-    if run.traffic is None:
-        return {}
-    speeds, gaps = np.linspace(0.5, fastest_mps, 40), np.linspace(0.25, 60.0, 240)
-    speed, gap = (each.ravel() for each in np.meshgrid(speeds, gaps, indexing="ij"))
-    drivers = library_records([driver for _, driver in family.stand_ins.values()], see_onset=False)
-    avoided = family.avoidable(run.traffic, rows, np.stack((gap, speed)), drivers)
-    if avoided is None:
-        return {}
-    crashes = ~avoided.reshape(speeds.size, gaps.size, len(family.stand_ins))
-    last = np.where(crashes.any(1), gaps[gaps.size - 1 - np.argmax(crashes[:, ::-1], axis=1)], 0.0)
-    return {name: (speeds, last[:, d]) for d, name in enumerate(family.stand_ins)}
 
 
 def pairs_plot(who: IntArray, weight: FloatArray, values: FloatArray, family: Family) -> Plot | None:

@@ -77,7 +77,7 @@ def _enumerate(
     max_steps = environment.numbers.max_steps
     for i in range(offset.size):
         number, keeps_speed = paths.number[i], recorded.n_steps.size == 0
-        steps = reach = walk(paths.start[i], seed, number, 0, max_steps, keeps_speed, environment, path)
+        steps = reach = walk(paths.start[i], seed, number, max_steps, keeps_speed, environment, path)
         if not keeps_speed:
             steps = min(recorded.n_steps[i], reach)
             for step in range(steps + 1):
@@ -88,7 +88,7 @@ def _enumerate(
             if path.hazard[cut] > 0.0 and cut % stride == offset[i]:
                 found.probability[i, cut] = stride * (math.exp(-hazard) * -math.expm1(-path.hazard[cut]))
                 if followers.drivers.size > 0:
-                    leave(cut, max_steps, seed, number, cut * FREE_DRAWS_PER_CUT_IN, 0, environment, path)
+                    leave(cut, max_steps, seed, number, cut * FREE_DRAWS_PER_CUT_IN, environment, path)
                     if gap(path.x[cut + 1, LV], path.x_after[cut + 1]) >= CONTACT_M:  # else it ends as bv_lv_contact
                         lead = draw_lead(cut, seed, number, environment.lateral)
                         found.crashes[i, cut] = who_crashes(followers, cut, lead, environment, path)
@@ -125,7 +125,7 @@ def _write(
     n, lv, bv = environment.numbers, found.lv, found.bv
     for i in range(cut.size):
         number, until = paths.number[i], cut[i] + 1 if cut[i] >= 0 else n.max_steps
-        steps = walk(paths.start[i], seed, number, 0, until, False, environment, path)
+        steps = walk(paths.start[i], seed, number, until, False, environment, path)
         before = (steps - 1) // n.hold_steps + 1
         for m in range(before):
             lv[i, m], bv[i, m] = path.lv[m], path.bv[m]
@@ -133,7 +133,7 @@ def _write(
         if cut[i] < 0:
             continue
         bv[i, before] = CUT_IN
-        drawn = leave(cut[i], n.max_steps, seed, number, cut[i] * stride, 0, environment, path)
+        drawn = leave(cut[i], n.max_steps, seed, number, cut[i] * stride, environment, path)
         for m in range(drawn):
             bv[i, before + 1 + m] = path.free[m]
         found.n_bv[i] += 1 + drawn

@@ -17,13 +17,12 @@ from harness.families.cut_in.laws import Environment, InitialStates
 from harness.families.cut_in.loading import load_environment, load_parameters, require_sound_laws
 from harness.families.cut_in.parameters import DEFAULT, EnvironmentParameters
 from harness.families.cut_in.path import empty_trajectory, mean_test_distance
-from harness.families.cut_in.replay import avoids, drive_along
-from harness.families.cut_in.script import facts_of, script_of
+from harness.families.cut_in.script import drive_along, facts_of, script_of
 from harness.families.cut_in.vocabulary import STATE_COLUMNS
 from harness.families.cut_in.words import AT_OVERLAP, STAND_INS, WORDS
 from harness.families.protocol import Chosen, Column, Exposure, Family, Paths
 from harness.families.words import CLOSING
-from harness.vocabulary import BV, LV, VEHICLES, BoolArray, FloatArray, IntArray, RecordArray
+from harness.vocabulary import BV, LV, VEHICLES, FloatArray, IntArray, RecordArray
 
 STATE_FACTS = (
     Column("v_bv_mps", pa.float64(), "m/s", "speed of BV"),
@@ -121,11 +120,6 @@ class CutIn(Family):
     def choose(self, traffic: Environment, seed: int, paths: Paths, event: IntArray, *, of_pool: bool = True) -> Chosen:
         maneuvers = write_maneuvers(seed, paths, event, traffic, FREE_DRAWS_PER_CUT_IN if of_pool else 0)
         return Chosen(facts_of(paths.start, maneuvers), event, maneuvers.lead)
-
-    def avoidable(
-        self, traffic: Environment, facts: Mapping[str, FloatArray], where: FloatArray, drivers: RecordArray
-    ) -> BoolArray | None:
-        return None if traffic.lateral.present else avoids(traffic, facts, where, drivers)
 
 
 CUT_IN = CutIn()

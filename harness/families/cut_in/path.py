@@ -105,19 +105,11 @@ def end_in(step: int, path: Trajectory) -> int:
 
 @compiled_inline
 def walk(
-    state: State,
-    seed: int,
-    episode: int,
-    known: int,
-    until: int,
-    ends_passed: bool,
-    environment: Environment,
-    path: Trajectory,
+    state: State, seed: int, episode: int, until: int, ends_passed: bool, environment: Environment, path: Trajectory
 ) -> int:
     """Walk from an initial state to a step, or to the end that an episode without cut-in finds; returns the step.
 
-    The AV keeps its speed, and ``ends_passed`` says whether the walk ends where it has passed BV. The first ``known``
-    maneuvers of LV and BV stand in ``path``; what comes after them is drawn, and written there.
+    The AV keeps its speed, and ``ends_passed`` says whether the walk ends where it has passed BV.
     """
     hold_steps = environment.numbers.hold_steps
     place(state, path.x[0], path.v[0])
@@ -126,7 +118,7 @@ def walk(
         if end == CONTACT or (end == PASSED and ends_passed):
             return step
         m, x, v, after = step // hold_steps, path.x[step], path.v[step], path.v[step + 1]
-        if step % hold_steps == 0 and m >= known:
+        if step % hold_steps == 0:
             u_lv, u_bv = uniform(seed, episode, LV_DRAWS, m), uniform(seed, episode, BV_DRAWS, m)
             path.lv[m] = laws.drive_freely(u_lv, v[LV], environment)
             path.bv[m] = laws.draw_acceleration(u_bv, laws.car_following(state_of(x, v), environment), environment)
@@ -150,12 +142,10 @@ def weigh_cut_ins(steps: int, environment: Environment, path: Trajectory) -> flo
 
 
 @compiled_inline
-def leave(
-    cut: int, until: int, seed: int, episode: int, first: int, known: int, environment: Environment, path: Trajectory
-) -> int:
+def leave(cut: int, until: int, seed: int, episode: int, first: int, environment: Environment, path: Trajectory) -> int:
     """BV's motion from its cut-in in step ``cut`` to a step; returns how many maneuvers that takes.
 
-    The first ``known`` of them stand in ``path``; the others are drawn, ``first`` being the index of the first.
+    They are drawn, ``first`` being the index of the first.
     """
     hold_steps = environment.numbers.hold_steps
     x, v = path.x[cut, BV], path.v[cut, BV]
@@ -163,9 +153,8 @@ def leave(
     draws = 0
     for step in range(cut, until):
         if step > cut and (step - cut - 1) % hold_steps == 0:
-            if draws >= known:
-                u = uniform(seed, episode, BV_FREE_DRAWS, first + draws)
-                path.free[draws] = laws.drive_freely(u, v, environment)
+            u = uniform(seed, episode, BV_FREE_DRAWS, first + draws)
+            path.free[draws] = laws.drive_freely(u, v, environment)
             a = acceleration(path.free[draws])
             draws += 1
         v_after = next_speed(v, a)
@@ -290,6 +279,6 @@ def mean_test_distance(seed: int, states: RecordArray, environment: Environment,
     """Mean distance (m) that the AV drives in an overtaking without cut-in; ``path`` is room to work in."""
     total = 0.0
     for i in range(states.size):
-        steps = walk(states[i], seed, i, 0, environment.numbers.max_steps, True, environment, path)
+        steps = walk(states[i], seed, i, environment.numbers.max_steps, True, environment, path)
         total += path.v[0, AV] * (0.1 * steps)
     return float(total / states.size)

@@ -1,7 +1,8 @@
-"""What is to be known of a cut-in to repeat it, and the motion that this is."""
+"""What is to be known of a cut-in to repeat it, the motion that this is, and who else crashes on it."""
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -9,11 +10,12 @@ import numpy as np
 from harness.compiled import compiled_threads, unboxed
 from harness.families.cut_in.events import Maneuvers
 from harness.families.cut_in.laws import Environment, acceleration
-from harness.families.cut_in.path import place
+from harness.families.cut_in.path import NO_CRASH, Trajectory, empty_trajectory, follow, place, take_over
 from harness.families.cut_in.vocabulary import STATE_COLUMNS, states_from
-from harness.families.protocol import Chosen
+from harness.families.protocol import Chosen, Driven
 from harness.families.script import Script, natural_script
-from harness.vehicles.kinematics import next_speed
+from harness.vehicles.kinematics import next_position, next_speed
+from harness.vehicles.sideways import onset_of
 from harness.vocabulary import AV, BV, LV, FloatArray, Int8Array, IntArray, RecordArray
 
 LEFT, RIGHT = 1, 0
@@ -55,7 +57,7 @@ def beginning(state: RecordArray) -> tuple[FloatArray, FloatArray, Int8Array]:
 
 
 def script_of(traffic: Environment, chosen: Chosen) -> Script:
-    """The motion of LV and BV, to the end of the longest test; beyond the last maneuver nothing can be meant."""
+    """The motion of LV and BV, to the end of the longest test; after its last maneuver BV keeps its speed."""
     facts, n, steps = chosen.facts, len(chosen.facts), int(traffic.numbers["max_steps"])
     x, v, lane = beginning(states_of(facts))
     speed, lanes = np.zeros((n, steps, BV + 1)), np.full((n, steps, BV + 1), LEFT, np.int8)
@@ -73,8 +75,8 @@ def _move(told: Maneuvers, cut: IntArray, hold_steps: int, v: FloatArray, speed:
                 a_lv = acceleration(told.lv[i, step // hold_steps])
             if left:
                 redraws = (step - cut[i] - 1) % hold_steps == 0
-            if redraws and used < told.n_bv[i]:
-                a_bv = acceleration(told.bv[i, used])
+            if redraws:
+                a_bv = acceleration(told.bv[i, used]) if used < told.n_bv[i] else 0.0
                 used += 1
             if step == cut[i]:
                 used += 1  # the mark
@@ -82,3 +84,44 @@ def _move(told: Maneuvers, cut: IntArray, hold_steps: int, v: FloatArray, speed:
             speed[i, step, LV], speed[i, step, BV] = v_lv, v_bv
             if 0 <= cut[i] <= step:
                 lanes[i, step, BV] = RIGHT
+
+
+def drive_along(
+    traffic: Environment, chosen: Chosen, start: FloatArray, drivers: RecordArray, *, last: bool = False
+) -> Driven:
+    """See `harness.families.protocol.Family.drive`."""
+    path, steps = empty_trajectory(traffic), int(traffic.numbers["max_steps"])
+    motion = np.zeros((len(drivers), steps + 1, 2) if last else (0, 0, 0))
+    out = Driven(np.zeros((len(chosen.at), len(drivers)), np.int64), motion, np.zeros((0, 0)))
+    _drive(unboxed(script_of(traffic, chosen)), start, unboxed(traffic), drivers, unboxed(path), unboxed(out))
+    return out._replace(ahead=np.stack((path.x_after, path.v_after), axis=1))
+
+
+@compiled_threads
+def _drive(
+    script: Script, start: FloatArray, environment: Environment, drivers: RecordArray, path: Trajectory, out: Driven
+) -> None:
+    """Drive others along cut-ins (n,); ``path`` is room to work in, and holds BV's motion of the last afterwards."""
+    most, motion = environment.numbers.max_steps, out.motion
+    path.slowest[:] = -math.inf  # nobody is let off before the end
+    for i in range(start.shape[0]):
+        cut, lead = script.at[i], script.lead[i]
+        after = onset_of(cut, lead) + 1
+        path.x[0], path.v[0] = script.x[i], script.v[i]
+        for step in range(most):
+            path.v[step + 1, BV], path.v[step + 1, AV] = script.speed[i, step, BV], path.v[0, AV]
+            for vehicle in (BV, AV):
+                v, v_after = path.v[step, vehicle], path.v[step + 1, vehicle]
+                path.x[step + 1, vehicle] = next_position(path.x[step, vehicle], v, v_after)
+        path.x_after[:], path.v_after[:] = path.x[:, BV], path.v[:, BV]
+        if not math.isnan(start[i, 0]):
+            path.x[after, AV], path.v[after, AV] = start[i]
+        for d in range(drivers.size):
+            for until in range(after if motion.size > 0 else most, most + 1):
+                take_over(0, d, drivers, drivers[d].delay_steps, False, cut, lead, environment, path)
+                follow(1, drivers, cut, lead, until, path)
+                if motion.size > 0:
+                    motion[d, until, 0], motion[d, until, 1] = path.follower[0].x, path.follower[0].v
+                out.end[i, d] = path.follower[0].end
+                if out.end[i, d] != NO_CRASH:
+                    break

@@ -40,8 +40,6 @@ WORDS = Words(
     unlikely="It is small because most naturalistic tests end without a cut-in, and so without a crash.",
     tests=_tests,
     rests=_rests,
-    limits=" Left of its line the competent driver (r157-cc), or the best of brakes (8 m/s² at once), crashes in the "
-    "vehicle’s place, too, if the car that cuts in keeps its speed.",
 )
 AT_OVERLAP = GAP._replace(words="gap at the overlap", head=("Gap at", "overlap"))
 STAND_INS = MappingProxyType(

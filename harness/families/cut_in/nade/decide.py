@@ -119,7 +119,7 @@ def begin(k: int, kernel: KernelState, nade: NadeKernel) -> None:
     if importance.n_forced == 0:
         return
     path, max_steps = nade.scratch.path, environment.numbers.max_steps
-    steps = walk(nade.states[cell.row], kernel.seed, cell.episode, 0, max_steps, True, environment, path)
+    steps = walk(nade.states[cell.row], kernel.seed, cell.episode, max_steps, True, environment, path)
     draws.hazard_total = weigh_cut_ins(steps, environment, path)
     p_event = -math.expm1(-draws.hazard_total)
     test.log_p_event = math.log(p_event)
