@@ -16,19 +16,17 @@ its claimed variance leaves out the error of the centring. See docs/scv-defect.m
 Both regressions rest on the triangular factor R of a tall matrix [1, H, Y] whose rows come in blocks (TSQR): factor the
 old R with the new rows below it. Unlike a Gram matrix this never squares the condition number, and the centring of H
 and Y by their means falls out of R for free: with the ones first, R without its first row and column is the factor of
-the centred columns.
+the centred columns. Of fewer rows than columns it has as many.
 """
 
 from __future__ import annotations
 
-import ctypes
 import math
 from collections.abc import Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba.extending import get_cython_function_address
 
 from harness.estimators.block import MAX_CONTROL_STEPS, Block
 from harness.estimators.estimate import Estimate, note
@@ -45,11 +43,6 @@ an eighth, which stands for that of every test then."""
 LEVERAGE = 1.0 - 1e-9
 """Leverage above which a test is fitted by itself alone: the others say nothing of it but their mean."""
 _ROWS_AT_ONCE = 4096
-_PANEL = 32
-_DTPQRT = ctypes.CFUNCTYPE(None, *[ctypes.c_void_p] * 12)(
-    get_cython_function_address("scipy.linalg.cython_lapack", "dtpqrt")
-)
-"""LAPACK's own routine: scipy's Python wrapper of it keeps the interpreter lock, so that no two threads could fold."""
 
 
 class MixtureCv(Nade):
@@ -63,9 +56,7 @@ class MixtureCv(Nade):
     def add(self, block: Block) -> None:
         """Fold one block's rows into the factor, in index order."""
         super().add(block)
-        ones = np.ones((len(block), 1))
-        columns = [ones, block.mixture_ratios() - 1.0, block.weighted_crashes()[:, None]]
-        rows = np.asfortranarray(np.concatenate(columns, axis=1))
+        rows = np.column_stack([np.ones(len(block)), block.mixture_ratios() - 1.0, block.weighted_crashes()])
         self._cubes = with_cubes(self._cubes, rows)
         self._factor = fold_rows(self._factor, rows)
 
@@ -98,19 +89,17 @@ def with_cubes(cubes: FloatArray, rows: FloatArray) -> FloatArray:
 
 
 def _regression(factor: FloatArray, n: int) -> tuple[FloatArray, int, float]:
-    """Least squares of Y on [1, H] from the factor (k, k) of ``n`` rows, of the smallest norm where columns depend.
+    """Least squares of Y on [1, H] from the factor of ``n`` rows, of the smallest norm where columns depend.
 
     Gives intercept and β, (1 + M,), the rank of [1, H] (Σ_j alpha_j h_j = 0 always costs one), and the variance of the
     intercept from that of the residuals.
     """
-    design, target = factor[:-1, :-1], factor[:-1, -1]
-    left, singular, right = np.linalg.svd(design)
-    kept = singular > max(n, len(design)) * np.finfo(np.float64).eps * singular[0]
-    projected = left.T @ target
-    coefficients = right[kept].T @ (projected[kept] / singular[kept])
-    residual_squares = float(factor[-1, -1] ** 2 + np.sum(projected[~kept] ** 2))
-    leverage = float(np.sum((right[kept, 0] / singular[kept]) ** 2))  # of the intercept, [(XᵀX)⁺]_00
-    rank = int(np.count_nonzero(kept))
+    left, singular, right = np.linalg.svd(factor[:, :-1])
+    rank = int(np.count_nonzero(singular > max(n, len(right)) * np.finfo(np.float64).eps * singular[0]))
+    projected, root = left.T @ factor[:, -1], right[:rank] / singular[:rank, None]
+    coefficients = root.T @ projected[:rank]
+    residual_squares = float(np.sum(projected[rank:] ** 2))
+    leverage = float(np.sum(root[:, 0] ** 2))  # of the intercept, [(XᵀX)⁺]_00
     variance = residual_squares / (n - rank) * leverage if n > rank else math.inf
     return coefficients, rank, variance
 
@@ -270,14 +259,6 @@ class Stratum:
         fill_product_columns(first_ratios, self._level, rows[:, 1:-1])
         return rows
 
-    def _with_waiting_rows(self) -> FloatArray:
-        """Triangular factor of all rows so far; of fewer rows than columns it has as many, which is far quicker."""
-        if self._factor is not None:
-            waiting = len(self._rows) > self._n_folded
-            return fold_rows(self._factor.copy(order="F"), self._waiting_rows()) if waiting else self._factor
-        rows = self._waiting_rows()
-        return np.asarray(np.linalg.qr(rows, mode="r")) if rows.shape[0] < rows.shape[1] else fold_rows(None, rows)
-
     def fit(self, *, leave_one_out: bool = False, tests_each: Sequence[int] = (1,)) -> StratumFit:
         """Solve the regression by SVD of the centred columns' triangular factor.
 
@@ -285,7 +266,8 @@ class Stratum:
         is customary, or times √n_l·|(1, means of the columns)| if larger, the norm of what centring has taken away:
         else rounding errors of columns that never vary would be fitted.
         """
-        factor = self._with_waiting_rows()
+        if (factor := self._factor) is None or len(self._rows) > self._n_folded:
+            factor = fold_rows(factor, self._waiting_rows())
         intercept, means = float(factor[0, -1] / factor[0, 0]), factor[0, 1:-1] / factor[0, 0]
         last = factor.shape[1] - 1
         centred, target = factor[1:last, 1:last], factor[1:last, last]
@@ -350,24 +332,5 @@ def fill_product_columns(first_ratios: FloatArray, n_control_steps: int, out: Fl
 
 
 def fold_rows(factor: FloatArray | None, rows: FloatArray) -> FloatArray:
-    """Make ``factor`` (k, k), upper triangular, that of the matrix behind it with more ``rows`` (m, k) below.
-
-    None is that of no rows. Both are in Fortran order, else `ValueError`; the rows are destroyed. The signs of the
-    factor's rows are arbitrary.
-    """
-    m, k = rows.shape
-    factor = np.zeros((k, k), order="F") if factor is None else factor
-    if not (factor.flags.f_contiguous and rows.flags.f_contiguous and factor.shape == (k, k)):
-        raise ValueError(f"expected Fortran-ordered (k, k) and (m, k), got {factor.shape} and {rows.shape}")
-    if m == 0:
-        return factor
-    panel = min(_PANEL, k)
-    reflectors, work = np.empty((panel, k), order="F"), np.empty(panel * k)
-    sizes, info = [ctypes.c_int(value) for value in (m, k, 0, panel)], ctypes.c_int()
-    rows_, columns, rows_already_triangular, panel_ = map(ctypes.addressof, sizes)
-    a, b, t, scratch = (array.ctypes.data for array in (factor, rows, reflectors, work))
-    of_result = ctypes.addressof(info)
-    _DTPQRT(rows_, columns, rows_already_triangular, panel_, a, columns, b, rows_, t, panel_, scratch, of_result)
-    if info.value != 0:
-        raise ArithmeticError(f"LAPACK dtpqrt refused argument {-info.value}")
-    return factor
+    """Triangular factor of the matrix behind a ``factor``, None of no rows, with more ``rows`` (m, k) below it."""
+    return np.asarray(np.linalg.qr(rows if factor is None else np.concatenate([factor, rows]), mode="r"))
