@@ -87,7 +87,6 @@ class Within:
     ci_high: float
     rhw: Number
     rhw_from_pool: Number
-    rhw_from_pool_at_least: Number
     n_episodes: int
     n_crashes: int
     n_failed: int
@@ -108,7 +107,6 @@ class ShellDetails:
     crash_rate_if_failed_had_crashed: float
     pool: str
     rhw_from_pool: Number
-    rhw_from_pool_at_least: Number
     p_event: float
     p_unreachable: float
     references: tuple[BesideReference, ...]
@@ -193,7 +191,7 @@ class SeenShells:
         free, y, cautions = self._limits(design.p.size, level), self.weight_of_a_crash(), self._cautions()
         squares = float((tally.crashes * y * y).sum())
         details = ShellDetails(
-            n_failed, tally.failed_as_crashes().rate(design.p), design.pool, *free.from_pool_relative(),
+            n_failed, tally.failed_as_crashes().rate(design.p), design.pool, free.from_pool_relative()[0],
             design.p_event, design.p_unreachable, () if cautions else compared(design, self.cells, level),
             self.within(confidence), self._shells((1.0 - confidence) / 2.0),
         )  # fmt: skip
@@ -314,7 +312,6 @@ class SeenShells:
         return Within(
             boundary=design.boundary, n_shells=n, crash_rate=limits.rate, ci_low=limits.low, ci_high=limits.high,
             rhw=limits.rhw, rhw_from_pool=limits.from_pool_relative()[0],
-            rhw_from_pool_at_least=limits.from_pool_relative()[1],
             crash_rate_if_failed_had_crashed=inside.failed_as_crashes().rate(design.p[:n]),
             refuted=outside.totals[1] > 0, refuted_by=tuple(crashed[:MOST_NAMED]),
             upper_bound_outside=self._limits(design.p.size, level, n).high, **counts,

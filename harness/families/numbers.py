@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from functools import cache
 from pathlib import Path
 from types import MappingProxyType
@@ -152,21 +152,14 @@ class ParameterFile(Section):
         return completed(given, cls.folder) if isinstance(given, dict) else given
 
     @property
+    def kinds(self) -> Any:
+        """Kinds of events of which data may have none (`harness.families.cut_in.sections.AcceptanceSteps`), or None."""
+        return None
+
+    @property
     def unseen(self) -> str:
         """Where the data had no event; empty where they had."""
-        return ""
-
-    def without_half(self) -> Mapping[int, Mapping[str, float]]:
-        """Numbers with which there are half as many events of each kind that the data have not."""
-        return {}
-
-    def unseen_in(self, kinds: Collection[int]) -> str:
-        """Where some of these kinds are."""
-        return ""
-
-    def as_if_unseen(self, row: Mapping[str, float]) -> dict[str, float]:
-        """A replicate with what no event at all leaves open upwards."""
-        return dict(row)
+        return "" if (kinds := self.kinds) is None else kinds.where(kinds.without_events)
 
     def left_open(self) -> LeftOpen | None:
         """What data leave open."""

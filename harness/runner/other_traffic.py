@@ -99,7 +99,7 @@ def traffic_error(moved: StoredShells, content: Mapping[str, Any], progress: Pro
         return None
     values = read_replicates(settings.parameters, parameters, moved.traffic.family.shipped)
     if (unseen := _unseen(moved, parameters, progress)) is not None:
-        values = [parameters.as_if_unseen(row) for row in values]
+        values = [parameters.kinds.as_if_unseen(row) for row in values]
     near = [each for each in moved.nearby(values, progress) if each is not None and not each.refused]
     if not near:
         expected = "replicates that these tests can answer"
@@ -125,12 +125,13 @@ def traffic_error(moved: StoredShells, content: Mapping[str, Any], progress: Pro
 
 def _unseen(moved: StoredShells, parameters: Parameters, progress: Progress) -> Unseen | None:
     """Steps in which no event was seen that carry a notable part of the rate, which is linear in each one's share."""
-    halved = parameters.without_half()
+    if (kinds := parameters.kinds) is None:
+        return None
+    halved = kinds.without_half()
     found = moved.nearby(list(halved.values()), progress)
     carried = {step: 2.0 * (1.0 - near.rate) for step, near in zip(halved, found, strict=True) if near is not None}
     carried = {step: part for step, part in carried.items() if part > CARRIES}
-    where = parameters.unseen_in(carried)
-    return Unseen(where, min(sum(carried.values()), 1.0), tuple(carried)) if carried else None
+    return Unseen(kinds.where(carried), min(sum(carried.values()), 1.0), tuple(carried)) if carried else None
 
 
 # -- what the answer depends on: fitted numbers move by their standard errors or, where there are replicates, in blocks,
@@ -255,7 +256,8 @@ def moves(
             raise CampaignError(f"--range {key}", f"{low:g}:{high:g}", expected, "Correct them, or change places.")
     blocks = {section: block for block, sections in parameters.blocks.items() for section in sections}
     if parameters.replicates is not None:
-        rows = [parameters.as_if_unseen(row) for row in read_replicates(name, parameters, shipped)[:N_REPLICATES]]
+        rows = read_replicates(name, parameters, shipped)[:N_REPLICATES]
+        rows = rows if parameters.kinds is None else [parameters.kinds.as_if_unseen(row) for row in rows]
         for block in parameters.blocks:
             columns = [key for key in rows[0] if blocks.get(key.split("__")[0]) == block]
             if columns:

@@ -37,7 +37,6 @@ from harness.records.schemas import baseline_table, episodes_table, padded
 from harness.resolved import Resolved
 from harness.sampling.protocol import ShardRequest, Source
 from harness.vehicles.drivers import Followers, driver_records
-from harness.vocabulary import FAILED
 
 SHARD_RUNS = 50
 """Baseline runs of one task: half a second of a slow controller."""
@@ -127,11 +126,8 @@ def without_event(loop: EpisodeLoop, resolved: Resolved, seed: int, paths: Paths
 
 def recorded(shard: Shard) -> Recorded:
     """Baseline runs as they come from the loop."""
-    episode = shard.episode
-    x, v = np.zeros((2, episode.size, shard.scenario.max_steps + 1))
-    for row, trace in shard.traces.items():
-        x[row, : len(trace)], v[row, : len(trace)] = trace[:, -1, 0], trace[:, -1, 1]
-    return Recorded(episode["n_steps"].astype(np.int64), episode["outcome"] == FAILED, x, v)
+    row = np.arange(shard.episode.size)
+    return as_recorded(baseline_table(shard, row, np.ones(row.size)), shard.scenario.max_steps)
 
 
 @dataclass(frozen=True)

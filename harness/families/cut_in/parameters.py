@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import ClassVar, Literal, Self
 
@@ -76,22 +76,9 @@ class EnvironmentParameters(ParameterFile):
         "lead of cut-ins": ("lateral",),
     }
 
-    # Kinds of events are steps of acceptance here.
-
     @property
-    def unseen(self) -> str:
-        return "" if (steps := self.acceptance_steps) is None else steps.where(steps.without_events)
-
-    def without_half(self) -> dict[int, dict[str, float]]:
-        if (steps := self.acceptance_steps) is None:
-            return {}
-        return {step: {f"{STEP}{step}": 0.5 * steps.share[step].value} for step in steps.without_events}
-
-    def unseen_in(self, kinds: Collection[int]) -> str:
-        return "" if self.acceptance_steps is None else self.acceptance_steps.where(kinds)
-
-    def as_if_unseen(self, row: Mapping[str, float]) -> dict[str, float]:
-        return dict(row) if self.acceptance_steps is None else self.acceptance_steps.as_if_unseen(row)
+    def kinds(self) -> sections.AcceptanceSteps | None:
+        return self.acceptance_steps
 
     def left_open(self) -> LeftOpen | None:
         """The range that is stated for who does not look, or shares of lane changes where none was seen."""

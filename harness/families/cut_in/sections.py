@@ -212,6 +212,10 @@ class AcceptanceSteps(Section):
         """Steps in which no lane change was seen, though some were counted."""
         return [step for step, events in enumerate(self.events or ()) if not events and self.exposure is not None]
 
+    def without_half(self) -> dict[int, dict[str, float]]:
+        """Numbers with which there are half as many events in each step without one."""
+        return {step: {f"{STEP}{step}": 0.5 * self.share[step].value} for step in self.without_events}
+
     def as_if_unseen(self, row: Mapping[str, float]) -> dict[str, float]:
         """A replicate with what zero events leave open upwards, in place of the draw that is right in the mean.
 
