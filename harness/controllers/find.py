@@ -16,7 +16,7 @@ from inspect import Parameter, Signature, isfunction, signature
 from operator import methodcaller
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
-from typing import Any, TypeVar, get_type_hints
+from typing import Any, TypeVar
 
 from harness.campaign.python_files import (
     FromSource,
@@ -194,17 +194,14 @@ def _loaded_once(
 def _as_class(found: Callable[..., Any], name: str) -> tuple[Callable[..., Any], dict[str, Any]]:
     """What is called with the parameters to make a controller; and what else ``found`` is handed, by name.
 
-    Nothing is called that a campaign names but a class, a function that says by its annotation which controller it
-    makes, and one that is itself the vehicle: its first argument is what the vehicle sees.
+    Nothing is called that a campaign names but a class with a step, and a function that is itself the vehicle: its
+    first argument is what the vehicle sees.
     """
     takes = _signature(found).parameters
     first = next(iter(takes.values()), None)
-    made = _what_it_makes(found)
-    if isfunction(found) and not _is_controller(made) and first is not None and first.default is Parameter.empty:
+    if isfunction(found) and first is not None and first.default is Parameter.empty:
         return lambda **parameters: SimpleNamespace(step=partial(found, **parameters)), {first.name: None}
-    _require_controller(made, name)
-    if not isinstance(found, type):
-        return found, {}
+    _require_controller(found if isinstance(found, type) else None, name)
     handed = {"loaded": None} if "loaded" in takes and callable(getattr(found, "load", None)) else {}
     if "traci" in takes and not _is_batch(found):
         return partial(StepListenerController, found), {"traci": None, **handed}
@@ -218,29 +215,14 @@ def _signature(found: Callable[..., Any]) -> Signature:
         return signature(lambda **parameters: parameters)
 
 
-def _what_it_makes(make: Callable[..., Any]) -> Any:
-    """The class itself, or the one that a function says it returns."""
-    if isinstance(make, type):
-        return make
-    try:
-        return get_type_hints(make).get("return")
-    except Exception:  # noqa: BLE001 - hints are the user's code, too
-        return None
-
-
 def _is_batch(made: Any) -> bool:
     return callable(getattr(made, "step_batch", None))
 
 
-def _is_controller(made: Any) -> bool:
-    return callable(getattr(made, "step", None)) or _is_batch(made)
-
-
 def _require_controller(made: Any, name: str) -> None:
-    if not _is_controller(made):
+    if not (callable(getattr(made, "step", None)) or _is_batch(made)):
         expected = "a function step(seen), or a class with step (per vehicle) or step_batch (arrays)"
         mend = "Write def step(self, seen): return 0.0, say: m/s², every 0.1 s (docs/controllers.md)."
-        mend = "A function without arguments says what it makes: `def make() -> MyAv:`." if made is None else mend
         wraps = "It has predict: wrap it as docs/policies.md shows (Any agent with `predict`)."
         mend = wraps if hasattr(made, "predict") else mend
         if meant := nearest("step", [each for each in dir(made) if each[0] != "_" and each != "step"]):
@@ -252,8 +234,8 @@ def _made(make: Callable[[], Any], name: str, guard: Guard) -> Any:
     """Make one controller, so that what its constructor refuses is an error of the campaign, not of every episode."""
     with guard:
         controller, wrong = guard.call(make, makes=True)
-    if wrong is not None or controller is None:
-        raise _not_made(name, wrong or "it returns None (is a return missing?)")
+    if wrong is not None:
+        raise _not_made(name, wrong)
     _require_controller(controller, name)
     batch = {"step_batch": "seen", "start_batch": "cells, episodes, random"}
     for method, given in (batch if _is_batch(controller) else {"step": "seen", "start": "episode"}).items():

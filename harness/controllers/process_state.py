@@ -40,7 +40,7 @@ class FloatingPointModes:
         kept, self._words = (memoryview(buffer).cast("B").cast("I") for buffer in (self._kept, now))
         self._look: Callable[..., object] = lambda: None
         self._write: Callable[..., object] = lambda _: None
-        if sys.platform == "linux" and platform.machine() in ("x86_64", "aarch64"):
+        if platform.machine() in ("x86_64", "aarch64"):
             libm = ctypes.CDLL("libm.so.6" if platform.libc_ver()[0] == "glibc" else None)
             libm.fegetenv(self._kept)
             libm.fegetenv(now)

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import os
 import subprocess
-import sys
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from shutil import which
@@ -159,7 +158,7 @@ def gui_program() -> Path:
         if (own := which("sumo-gui")) is None:
             raise
         program = Path(own)
-    if sys.platform.startswith("linux") and not os.environ.get("DISPLAY"):
+    if not os.environ.get("DISPLAY"):
         raise _no_window("no screen (the environment variable DISPLAY is not set)")
     return program
 

@@ -57,9 +57,9 @@ _QUOTED = 2
 
 
 def missing_libraries() -> list[SystemLibrary]:
-    """Those that the dynamic loader does not find (it takes 40 ms to ask); none where SUMO's wheels are not Linux's."""
+    """Those that the dynamic loader does not find; it takes 40 ms to ask."""
     missing = []
-    for library in LIBRARIES if sys.platform.startswith("linux") else ():
+    for library in LIBRARIES:
         try:
             ctypes.CDLL(library.soname)
         except OSError:

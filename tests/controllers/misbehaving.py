@@ -182,10 +182,6 @@ def says_nothing():
     Path("called").touch()
 
 
-def forgets_to_return() -> IDM:
-    IDM()
-
-
 class Prints(IDM):
     def __init__(self):
         super().__init__()

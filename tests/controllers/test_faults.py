@@ -192,7 +192,6 @@ REFUSED = [
     ),
     (_of("RaisesForOtherNames"), "av.controller", "cannot be made: RuntimeError: step_batch (misbehaving.py:"),
     (_of("says_nothing"), "av.controller", "without step"),
-    (_of("forgets_to_return"), "av.controller", "cannot be made: it returns None (is a return missing?)"),
     (_of("an_object"), "av.controller", "fix:      It has: "),
     (_of("StepMisspelt"), "av.controller", "fix:      Rename stp to step.\n"),
     (_of("StepOfProperty"), "av.controller", "fix:      Write def step(self, seen): return 0.0"),

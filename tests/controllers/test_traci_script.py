@@ -118,7 +118,6 @@ AT_THE_DOOR = {
     "commands ego and LV": text("traci.vehicle.setSpeed('ego', 20.0); traci.vehicle.setSpeed('LV', 20.0)"),
     "never calls simulationStep": NEVER_STEPS,
     r"ZeroDivisionError: division by zero \(my.py:7\)": text("traci.vehicle.setSpeed('ego', 1 / 0)"),
-    r"SystemExit: no more \(my.py:7\)": text("sys.exit('no more')"),
     "simulationStep is refused in a thread": (
         "import concurrent.futures, traci\ntraci.simulationStep()\n"
         "with concurrent.futures.ThreadPoolExecutor() as threads:\n    threads.submit(traci.simulationStep)\n"
@@ -126,12 +125,6 @@ AT_THE_DOOR = {
     "goes on when its simulation has ended": f"{ENDLESS}    except Exception:\n        pass\n",
     r"no answer within 0.2 s .*construction_time_s\) \(my.py:8\)": text(
         "traci.vehicle.setSpeed('ego', 9.0)\n    while True: pass"
-    ),
-    r"traci.vehicle.setMaxSpeed is refused.*\(my.py:7\)": text(
-        "traci.vehicle.setSpeed('ego', 9.0); traci.vehicle.setMaxSpeed('ego', 9.0)"
-    ),
-    r"traci.close is refused after 0.1 s, before the test has ended.*\(my.py:7\)": text(
-        "traci.vehicle.setSpeed('ego', 9.0); traci.close()"
     ),
     r"traci has no trafficlight here; it has .*\(my.py:7\)": text(
         "traci.vehicle.setSpeed('ego', 9.0); traci.trafficlight.getIDList()"

@@ -336,7 +336,6 @@ def test_without_its_extra_or_a_screen_the_gui_is_refused_in_words(stored_run, m
         assert gui_program() == own
         assert main(["replay", folder, "3", "--gui"]) == 2
         assert "a sumo-gui that ends with 3" in capsys.readouterr().err
-    monkeypatch.setattr("sys.platform", "linux")
     monkeypatch.delenv("DISPLAY", raising=False)
     with pytest.raises(CampaignError, match="DISPLAY is not set"):
         gui_program()

@@ -180,24 +180,18 @@ def test_a_program_that_never_connects_fails_its_episodes():
 
 
 @pytest.mark.parametrize(
-    ("fault", "vehicle"), [("moves_bv", "BV1"), pytest.param("changes_lane", "AV", marks=pytest.mark.slow)]
+    ("fault", "cells", "early", "said"),
+    [
+        ("moves_bv", 4, False, "SUMO, BV1.*may only command AVs"),
+        pytest.param("changes_lane", 4, False, "SUMO, AV.*may only command AVs", marks=pytest.mark.slow),
+        ("removes_av", 4, True, "SUMO, AV1: found a vehicle that has left the road"),
+        ("stops_dead", 1, True, r"SUMO, AV0: found -[0-9.]+ m/s²; expected -15 to 10 m/s²"),
+    ],
 )
-def test_moving_what_is_not_the_clients_stops_the_run(fault, vehicle):
-    with pytest.raises(WorldDisagreementError, match=f"SUMO, {vehicle}") as caught:
-        run(program(MISBEHAVING, fault), 0, 8, cells=4)
-    assert "may only command AVs" in str(caught.value)
-
-
-def test_an_av_that_is_not_there_any_more_stops_it_too():
-    av = program(MISBEHAVING, "removes_av")
-    with pytest.raises(WorldDisagreementError, match="SUMO, AV1: found a vehicle that has left the road"):
-        run_in(TraciWorld(4, av.traci, av.limits, acts_before_event=True), av, [(0, 8)])
-
-
-def test_nor_may_it_brake_as_no_vehicle_can():
-    av = program(MISBEHAVING, "stops_dead")
-    with pytest.raises(WorldDisagreementError, match=r"SUMO, AV0: found -[0-9.]+ m/s²; expected -15 to 10 m/s²"):
-        run_in(TraciWorld(1, av.traci, av.limits, acts_before_event=True), av, [(0, 2)])
+def test_what_no_client_may_do_stops_the_run(fault, cells, early, said):
+    av = program(MISBEHAVING, fault)
+    with pytest.raises(WorldDisagreementError, match=said):
+        run_in(TraciWorld(cells, av.traci, av.limits, acts_before_event=early), av, [(0, 2 * cells)])
 
 
 def load(command, more=""):
