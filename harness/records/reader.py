@@ -169,9 +169,8 @@ class ShownTests:
     """Consecutive tests of a run.
 
     ``outcomes``, and ``causes`` of failures, are counted over all. ``rows`` are of tests that had an event or a weight
-    other than 1: `COLUMNS`, outcome, facts that are numbers and, of events that can be seen beforehand, their lead and
-    the contact. Of the others, most in plain naturalistic driving, there is nothing to draw. ``crashes`` are what the
-    motion of crashes follows from.
+    other than 1: `COLUMNS`, outcome, facts that are numbers. Of the others, most in plain naturalistic driving, there
+    is nothing to draw. ``crashes`` are what the motion of crashes follows from.
     """
 
     outcomes: Counter[str]
@@ -218,8 +217,7 @@ class ShownTests:
 
 def _columns(family: Family, *, sees: bool) -> tuple[list[str], list[str]]:
     numbers = [each.name for each in family.columns if not each.length]
-    in_time = [LEAD, "contact"] if sees else []
-    return [*COLUMNS, *numbers, *in_time, "outcome"], [*path_columns(family), *in_time[:1], "outcome"]
+    return [*COLUMNS, *numbers, "outcome"], [*path_columns(family), *([LEAD] if sees else []), "outcome"]
 
 
 def hardest_crash(folder: Path) -> tuple[Path, int]:

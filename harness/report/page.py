@@ -15,7 +15,7 @@ from harness.report import several
 from harness.report.crashes import Replay, crash_gallery, crashing_pairs, scenes_of, shown_of
 from harness.report.drawing import Plot, style_of_plots
 from harness.report.plots import convergence_plot, sensitivity_plot, severity_plot, shells_plot, where_plot
-from harness.report.summary import RunFolder, RunSummary, lateral_facts, summarise, typed
+from harness.report.summary import RunFolder, RunSummary, summarise, typed
 from harness.report.templates import write_page
 from harness.report.words import short_answer
 from harness.vocabulary import FAILED, OUTCOMES
@@ -32,7 +32,8 @@ def write_page_of(run: RunFolder) -> Path:
     _write_plots(folder / "plots", plots)
     return write_page(
         folder / "report.html", "report.html.j2",
-        run=run, answer=answer, summary=summary, gallery=gallery, scenes=scenes, lateral=lateral_facts(run),
+        run=run, answer=answer, summary=summary, gallery=gallery, scenes=scenes,
+        shows=run.manifest["events_show"],
         figures={plot.name: plot for plot in plots}, family=family, words=family.words, shown=shown_of(family),
         outcomes=list(zip(OUTCOMES, summary.count, summary.weight, strict=True)),
         estimators=sorted(run.estimates.estimates.items(), key=lambda item: item[0] != run.estimates.headline),

@@ -29,7 +29,6 @@ from harness.families import family_named
 from harness.families.protocol import Environment, Family
 from harness.records.folder import read_as, read_manifest
 from harness.records.reader import ShownTests, by_kind, read_campaign, read_traces, traffic_of
-from harness.records.schemas import LEAD
 from harness.sampling.shells import stored_design
 from harness.strata import ShellDesign, weight_of_a_test
 from harness.vehicles.kinematics import STEP_S
@@ -183,7 +182,7 @@ def summarise(run: RunFolder) -> RunSummary:
     tests, where = run.tests, str(run.path / "episodes")
     places = outcome_places(pa.chunked_array([[*tests.outcomes]]), where)
     count: FloatArray = np.bincount(places, [*tests.outcomes.values()], len(OUTCOMES)).astype(np.float64)
-    names = [name for name in tests.rows.column_names if name not in ("outcome", "contact")]
+    names = [name for name in tests.rows.column_names if name != "outcome"]
     rows = {name: floats(tests.rows[name]) for name in names}
     outcome = outcome_places(tests.rows["outcome"], where).astype(np.int64)
     left_out: FloatArray = count - np.bincount(outcome, minlength=len(OUTCOMES))  # those weigh 1 each
@@ -201,19 +200,3 @@ def summarise(run: RunFolder) -> RunSummary:
     weight[FAILED] = 0.0
     all_one = not rows["log_weight"][outcome != FAILED].any()
     return RunSummary(count, weight, by_kind(tests.causes), rows, all_one, run.shells is not None)
-
-
-def lateral_facts(run: RunFolder) -> dict[str, Any] | None:
-    """How cut-ins of the tests showed themselves, as sampled; None where they are one step.
-
-    ``lead_s`` are 5 %, 50 % and 95 % quantiles of the leads of ``n_events``; ``n_side`` of ``n_crashes`` were side
-    contacts.
-    """
-    rows = run.tests.rows
-    if LEAD not in rows.column_names:
-        return None
-    lead_s = STEP_S * floats(rows.filter(pc.is_valid(rows["event_step"]))[LEAD])
-    contacts = Counter(rows["contact"].drop_null().to_pylist())
-    quantiles = np.quantile(lead_s, (0.05, 0.5, 0.95)).tolist() if lead_s.size else [math.nan] * 3
-    crashes = {"n_crashes": contacts.total(), "n_side": contacts["side"]}
-    return {"n_events": lead_s.size, "lead_s": quantiles, **crashes}
