@@ -82,7 +82,7 @@ def schema() -> None:
 def setup(*, dry_run: bool) -> None:
     """Install the system libraries that SUMO needs, if any are missing; compile, and build a pool (a minute).
 
-    pip cannot install these few (X11, GL); a desktop has them. They are installed with apt-get, dnf or apk, as root or
+    pip cannot install these few (X11, GL); a desktop has them. They are installed with apt-get or dnf, as root or
     with sudo, which may ask for your password at a terminal. A campaign with world.engine twin needs none.
 
     Exit code 2 says that they could not be installed; the message names the packages.

@@ -41,7 +41,7 @@ class FloatingPointModes:
         self._look: Callable[..., object] = lambda: None
         self._write: Callable[..., object] = lambda _: None
         if platform.machine() in ("x86_64", "aarch64"):
-            libm = ctypes.CDLL("libm.so.6" if platform.libc_ver()[0] == "glibc" else None)
+            libm = ctypes.CDLL("libm.so.6")
             libm.fegetenv(self._kept)
             libm.fegetenv(now)
             self._look, self._write = partial(libm.fegetenv, ctypes.byref(now)), libm.fesetenv

@@ -26,29 +26,27 @@ SUMO_VERSION = "1.28.0"
 
 
 class SystemLibrary(NamedTuple):
-    """A shared library, and the packages that bring it on Debian and Ubuntu, on Fedora and its kin, and on Alpine."""
+    """A shared library, and the packages that bring it on Debian and Ubuntu, and on Fedora and its kin."""
 
     soname: str
     apt: str
     dnf: str
-    apk: str
 
 
 LIBRARIES = (
-    SystemLibrary("libX11.so.6", "libx11-6", "libX11", "libx11"),
-    SystemLibrary("libXext.so.6", "libxext6", "libXext", "libxext"),
-    SystemLibrary("libXrender.so.1", "libxrender1", "libXrender", "libxrender"),
-    SystemLibrary("libGL.so.1", "libgl1", "libglvnd-glx", "mesa-gl"),
-    SystemLibrary("libatomic.so.1", "libatomic1", "libatomic", "libatomic"),
-    SystemLibrary("libexpat.so.1", "libexpat1", "expat", "libexpat"),
-    SystemLibrary("libz.so.1", "zlib1g", "zlib", "zlib"),
-    SystemLibrary("libstdc++.so.6", "libstdc++6", "libstdc++", "libstdc++"),
+    SystemLibrary("libX11.so.6", "libx11-6", "libX11"),
+    SystemLibrary("libXext.so.6", "libxext6", "libXext"),
+    SystemLibrary("libXrender.so.1", "libxrender1", "libXrender"),
+    SystemLibrary("libGL.so.1", "libgl1", "libglvnd-glx"),
+    SystemLibrary("libatomic.so.1", "libatomic1", "libatomic"),
+    SystemLibrary("libexpat.so.1", "libexpat1", "expat"),
+    SystemLibrary("libz.so.1", "zlib1g", "zlib"),
+    SystemLibrary("libstdc++.so.6", "libstdc++6", "libstdc++"),
 )
 # Ubuntu's own updates hold the lock for some minutes after a first start: wait instead of failing.
 _INSTALL = {
     "apt": ("apt-get update", "apt-get -o DPkg::Lock::Timeout=300 install -y --no-install-recommends"),
     "dnf": ("dnf install -y --setopt=install_weak_deps=False",),
-    "apk": ("apk add --no-cache",),
 }
 _ASK_NOTHING = ("env", "DEBIAN_FRONTEND=noninteractive", "LC_ALL=C")
 _REINSTALL = f"install libsumo again: pip install --force-reinstall libsumo=={SUMO_VERSION}"
@@ -97,7 +95,7 @@ def install_commands(missing: Sequence[SystemLibrary]) -> list[list[str]]:
     """Commands that install missing libraries here, or a `HarnessError`: no known package manager, or no right to."""
     manager = next((name for name, commands in _INSTALL.items() if shutil.which(commands[0].split()[0])), None)
     if manager is None:
-        raise _cannot_load(missing, "None of apt-get, dnf and apk is here: install them as this system does")
+        raise _cannot_load(missing, "Neither apt-get nor dnf is here: install them as this system does")
     root: list[str] = []
     if os.geteuid() != 0:
         if shutil.which("sudo") is None:
@@ -150,9 +148,8 @@ def _cannot_load(missing: Sequence[SystemLibrary], advice: str) -> HarnessError:
 
 
 def _install_lines(libraries: Sequence[SystemLibrary]) -> str:
-    apt, dnf, apk = (" ".join(getattr(library, manager) for library in libraries) for manager in ("apt", "dnf", "apk"))
+    apt, dnf = (" ".join(getattr(library, manager) for library in libraries) for manager in ("apt", "dnf"))
     return (
         f"    Debian, Ubuntu:  apt-get update && apt-get install -y --no-install-recommends {apt}\n"
-        f"    Fedora, RHEL:    dnf install -y {dnf}\n"
-        f"    Alpine:          apk add {apk}"
+        f"    Fedora, RHEL:    dnf install -y {dnf}"
     )

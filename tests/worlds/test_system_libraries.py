@@ -15,13 +15,12 @@ from harness.worlds.system_libraries import LIBRARIES, SystemLibrary
 from tests.stored_runs import SCENARIOS
 
 SMOKE = str(SCENARIOS / "smoke.yaml")
-NOWHERE = SystemLibrary("libnowhere.so.7", "libnowhere7", "nowhere-libs", "nowhere")
+NOWHERE = SystemLibrary("libnowhere.so.7", "libnowhere7", "nowhere-libs")
 ALWAYS_THERE = ("ld-linux", "libc.", "libdl.", "libgcc_s.", "libm.", "libpthread.", "libresolv.", "librt.")
 LEAN = "--no-install-recommends"
 MANAGERS = {
     "apt-get": ["apt-get update", f"apt-get -o DPkg::Lock::Timeout=300 install -y {LEAN} libnowhere7"],
     "dnf": ["dnf install -y --setopt=install_weak_deps=False nowhere-libs"],
-    "apk": ["apk add --no-cache nowhere"],
 }
 """What each package manager is called with."""
 
@@ -84,7 +83,7 @@ def test_commands_that_open_sumo_name_what_is_missing(command, bare_machine, tmp
     assert main([command, SMOKE]) == EXIT_BAD_INPUT
     said = capsys.readouterr()
     assert said.out == ""
-    for words in ("libnowhere.so.7", "harness setup", "libnowhere7", "dnf install -y nowhere-libs", "apk add nowhere"):
+    for words in ("libnowhere.so.7", "harness setup", "libnowhere7", "dnf install -y nowhere-libs"):
         assert words in said.err
     assert "libX11" not in said.err  # what is there needs no package
     assert not any((tmp_path / "runs").rglob("*.*"))
@@ -127,7 +126,7 @@ def test_setup_does_nothing_where_nothing_is_missing(programs, capsys):
     assert programs.calls() == []
 
 
-USERS = [*((manager, 0, False, "") for manager in MANAGERS), ("apk", 1, False, "sudo -n env")]
+USERS = [*((manager, 0, False, "") for manager in MANAGERS), ("dnf", 1, False, "sudo -n env")]
 
 
 @pytest.mark.parametrize(("manager", "user", "terminal", "sudo"), USERS)
