@@ -71,9 +71,7 @@ class PlotAxis(NamedTuple):
 
 
 def tick_label(value: float) -> str:
-    """Plain digits from 0.01 to 9999, else ``10⁻⁷`` or ``2·10⁻⁷``; none for 0."""
-    if value <= 0.0:
-        return ""
+    """Plain digits from 0.01 to 9999, else ``10⁻⁷`` or ``2·10⁻⁷``."""
     if 0.0099 < value < 9_999.5:
         return f"{value:.3g}" if value < 1000.0 else f"{value:.0f}"
     exponent = math.floor(math.log10(value) + 1e-9)  # of a value such as 1e-7 it may come out just below

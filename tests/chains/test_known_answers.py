@@ -150,14 +150,6 @@ def test_known_means_cover_and_sample_means_do_not(tilt):
     assert not covers(found["wrong"]["covered"])
 
 
-@pytest.mark.slow
-def test_known_mean_control_variates_cover_on_a_chain():
-    chain = DECISIVE[0]
-    one = {"mixture_cv": MixtureCv}
-    found = replicate(lambda rng: draw(chain, "episode_mixture", N, rng), 12, one, chain.crash_rate)
-    assert covers(found["mixture_cv"]["covered"])
-
-
 # -- vehicles on the same cut-ins: joint outcomes, and shells that they make --
 
 

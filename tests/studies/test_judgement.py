@@ -1,4 +1,4 @@
-"""Judgements from rows that are made up; shells and forced cut-ins on exact chains, and wrong methods that fail there.
+"""Judgements from rows that are made up; shells on exact chains, and wrong methods that fail there.
 
 All seeds are fixed. A right method fails the small experiments with probability 5 % per family by the criterion itself,
 once and for all: with these seeds it passes. The wrong ones must fail at p < 1e-6.
@@ -6,7 +6,6 @@ once and for all: with these seeds it passes. The wrong ones must fail at p < 1e
 
 import json
 import math
-from functools import partial
 
 import numpy as np
 import pytest
@@ -16,7 +15,7 @@ from harness.campaign.files import load_campaign
 from harness.families import family_named
 from harness.progress import Progress
 from harness.strata import ShellDesign
-from studies.chains.chain import CHAINS, REPLAYED
+from studies.chains.chain import CHAINS
 from studies.chains.shells import ChainShells
 from studies.replication import populations
 from studies.replication.experiment import Experiment, load_experiment
@@ -24,7 +23,6 @@ from studies.replication.judgement import FORMER, Judgement, Row, Subject, corre
 from studies.replication.populations import Known, preventable_by, ratio_to
 from studies.replication.run import validate
 from studies.replication.shells import FREE, WITHIN, DrawnPool, PairedCampaign, ShellCampaign
-from studies.replication.weighted import WeightedCampaign, chain_episodes
 from tests.golden.record import unlike
 from tests.stored_runs import ROOT, SCENARIOS
 from tests.studies.here import wrong_shell
@@ -165,21 +163,6 @@ def judged(runs: dict[str, list[Row]], result: str) -> list[Judgement]:
 def shells(chain, replications: int, episodes: int, wrong: float = 1.0) -> list[Row]:
     draw = wrong_shell(ChainShells(chain, 2048).draw, 0, wrong)
     return ShellCampaign(campaign("shells", episodes), draw, 5).run(range(replications))
-
-
-def forced(chain) -> list[Row]:
-    episodes = partial(chain_episodes, chain, "forced", 7)
-    return WeightedCampaign(campaign("forced", 3000), episodes, ["nade"]).run(range(FEW))
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("result", "repeated"), [(FREE, lambda chain: shells(chain, FEW, 1000)), ("nade", forced)], ids=["shells", "forced"]
-)
-def test_right_methods_cover_and_are_unbiased(result, repeated):
-    for one in judged({chain.name: repeated(chain) for chain in REPLAYED}, result):
-        assert not one["coverage_too_low"]
-        assert abs(one["bias"]) < 4.0 * one["bias_std_error"]
 
 
 @pytest.mark.slow
