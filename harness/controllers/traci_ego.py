@@ -134,6 +134,8 @@ class _Tried(VehicleDomain):
         if isinstance(ego, _AnyName):
             self._seen = _Anybody(self._seen, ego)
 
+    getAccel, getDecel = staticmethod(lambda _: 2.6), staticmethod(lambda _: 4.5)  # of SUMO's default type
+
     def next_acceleration(self) -> float:
         acceleration = super().next_acceleration()
         if math.isinf(self._decel) and self._speed_mode & DECEL:  # no bound of its own

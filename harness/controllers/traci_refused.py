@@ -30,9 +30,9 @@ class FatalTraCIError(Exception):
 
 
 class RefusedError(TraCIException):
-    """What the harness cannot do: the ``last`` of a turn fails its test also where a script catches it."""
+    """What the harness cannot do: the ``last`` of a turn, or what it lacks, fails its test also where it is caught."""
 
-    last: ClassVar[RefusedError | None] = None
+    last: ClassVar[Exception | None] = None
 
     def __init__(self, text: str) -> None:
         super().__init__(text)
@@ -54,7 +54,8 @@ class Domain:
             domains = [entry for entry in vars(self) if isinstance(getattr(self, entry), Domain) and entry[0] != "_"]
             there = f"; it has {', '.join(domains)}" if domains else ": delete the line, or put in a value of your own"
             there = "" if did_you_mean(name, domains or public) else there
-            raise AttributeError(f"{self._path} has no {name} here{there}", name=name, obj=self)
+            RefusedError.last = AttributeError(f"{self._path} has no {name} here{there}", name=name, obj=self)
+            raise RefusedError.last
 
         def refused(*_arguments: Any, **_named: Any) -> NoReturn:
             raise RefusedError(f"{self._path}.{name} is refused: {why}.")

@@ -62,7 +62,7 @@ class _Simulation(SimulationDomain):
 
     def subscribe(self, varIDs: Sequence[int] = (0x74,), *_when: Any, **_how: Any) -> None:
         """Ask for variables, for the whole test; by default who departs."""
-        self._subscribed = known_variables(varIDs, _OF_SIMULATION, "the simulation")
+        self._subscribed += known_variables(varIDs, _OF_SIMULATION, "the simulation")
 
     def getSubscriptionResults(self) -> dict[int, Any]:
         return {number: getattr(self, _OF_SIMULATION[number])() for number in self._subscribed}

@@ -67,7 +67,7 @@ _QUESTIONS: dict[str, tuple[int, Callable[[SeenVehicle], Any]]] = {
 _VARIABLES = {number: name for name, (number, _) in _QUESTIONS.items()} | {_LEADER: "getLeader", 0x78: "getFollower"}
 """What can be subscribed to, by number."""
 _OF_THE_AV = {"getSpeedMode": "_speed_mode", "getAccel": "_accel", "getDecel": "_decel"}
-"""What has been set of it, and where that is kept: bounds of its commands (m/s²) are infinite without."""
+"""What has been set of it, and where that is kept."""
 _NEIGHBOURS = ("getLeftFollowers", "getRightFollowers", "getLeftLeaders", "getRightLeaders")
 """Modes of `VehicleDomain.getNeighbors`, from 0; with ``blockingOnly`` each is four more."""
 _ACCEPTED: dict[str, tuple[Callable[[Any], bool], str]] = {
@@ -103,13 +103,10 @@ class VehicleDomain(Domain):
         self._accel = self._decel = math.inf
         self._speed_mode = _ACCEL | DECEL
         self._subscribed: dict[str, tuple[int, ...]] = {}
-        self._around: dict[str, tuple[float, tuple[int, ...]]] = {}
+        self._around: dict[str, dict[float, tuple[int, ...]]] = {}
         """Range (m) and variables of what has been subscribed to around a vehicle."""
-        self._lv, self._bv, self._own = (
-            SeenVehicle(1, MAX_SPEED_MPS),
-            SeenVehicle(1, MAX_SPEED_MPS),
-            SeenVehicle(0, set_speed_mps),
-        )
+        self._lv, self._bv = SeenVehicle(1, MAX_SPEED_MPS), SeenVehicle(1, MAX_SPEED_MPS)
+        self._own = SeenVehicle(0, set_speed_mps)
         self._others = {name: other for name, other in ((lv_name, self._lv), (bv_name, self._bv)) if name}
         self._seen = {**self._others, ego: self._own}
         self._begun = False
@@ -173,7 +170,8 @@ class VehicleDomain(Domain):
 
     def subscribe(self, objectID: str, varIDs: Sequence[int] | None = None, *_when: Any, **_how: Any) -> None:
         self._of(objectID)
-        self._subscribed[objectID] = known_variables(varIDs, _VARIABLES, "vehicles")
+        wanted = known_variables(varIDs, _VARIABLES, "vehicles")
+        self._subscribed[objectID] = *self._subscribed.get(objectID, ()), *wanted
 
     def subscribeLeader(self, vehID: str, *_when: Any, **_how: Any) -> None:
         self._of(vehID)
@@ -197,13 +195,15 @@ class VehicleDomain(Domain):
         self._of(objectID)
         if domain != _VEHICLES:
             raise RefusedError(f"vehicle.subscribeContext of domain {domain:#x} is refused: there are vehicles alone.")
-        self._around[objectID] = dist, known_variables(varIDs, _VARIABLES, "vehicles")
+        around = self._around.setdefault(objectID, {})
+        around[dist] = *around.get(dist, ()), *known_variables(varIDs, _VARIABLES, "vehicles")
 
     def getContextSubscriptionResults(self, objectID: str) -> dict[str, dict[int, Any]]:
-        dist, variables = self._around.get(objectID, (-1.0, ()))
-        here = self.getPosition(objectID)
-        near = [name for name in self._seen if math.dist(here, self.getPosition(name)) <= dist]
-        return {name: self._values(name, variables) for name in near}
+        here, found = self.getPosition(objectID), dict[str, dict[int, Any]]()
+        for dist, variables in self._around.get(objectID, {}).items():
+            for name in (name for name in self._seen if math.dist(here, self.getPosition(name)) <= dist):
+                found.setdefault(name, {}).update(self._values(name, variables))
+        return found
 
     def getLeader(self, vehID: str, dist: float = 100.0) -> tuple[str, float] | None:  # noqa: ARG002 - TraCI's signature
         """Vehicle ahead on the lane and the gap to it (m, less the minGap of zero), however far away.
@@ -217,13 +217,12 @@ class VehicleDomain(Domain):
         return self._nearest(vehID, -1.0) or ("", -1.0)
 
     def getNeighbors(self, vehID: str, mode: int) -> tuple[tuple[str, float], ...]:
-        """Nearest vehicle on a lane beside, and the gap (m): 1 the right one, not the left; 2 ahead, not behind.
-
-        With 4 only one that is in the way of a lane change: one beside.
-        """
+        """Nearest vehicle on a lane beside, and the gap (m): 1 the right one, not the left; 2 ahead, not behind."""
+        if mode & 4:
+            raise RefusedError("blockingOnly is refused: SUMO's lane change model, which says who blocks, is not here.")
         lane = self._of(vehID).lane + (-1 if mode & 1 else 1)
         found = self._nearest(vehID, 1.0 if mode & 2 else -1.0, lane)
-        return () if found is None or (mode & 4 and found[1] > 0.0) else (found,)
+        return () if found is None else (found,)
 
     def _nearest(self, vehID: str, direction: float, lane: int | None = None) -> tuple[str, float] | None:
         own = self._of(vehID)
@@ -251,17 +250,13 @@ class VehicleDomain(Domain):
 
     def setAcceleration(self, vehID: str, acceleration: float, duration: float) -> None:
         self._require_own(vehID, "setAcceleration")
-        self._begin(partial(self._accelerate, _finite(acceleration), duration), duration)
+        self._begin(partial(self._accelerate, _finite(acceleration), _finite(duration, 0.0)), duration)
 
     def slowDown(self, vehID: str, speed: float, duration: float) -> None:
         self._require_own(vehID, "slowDown")
-        if not speed >= 0.0:
-            raise TraCIException("Speed must not be negative.")
-        self._begin(partial(self._approach, _finite(speed), duration), duration)
+        self._begin(partial(self._approach, _finite(speed, 0.0), _finite(duration, 0.0)), duration)
 
     def _begin(self, command: Callable[[], Iterator[float]] | None, duration: float) -> None:
-        if not duration >= 0.0:  # nan is not, either
-            raise TraCIException("Duration must not be negative.")
         caller = sys._getframe(2)
         self.told_at = caller.f_code.co_filename, caller.f_lineno, self._speed_mode
         self._plan = iter(()) if command is None else command()
@@ -273,15 +268,15 @@ class VehicleDomain(Domain):
             yield (speed - self._own.speed) / self.step_s
 
     def _accelerate(self, acceleration: float, duration: float) -> Iterator[float]:
-        """For whole steps, and a share of a last one."""
-        left = duration / self.step_s
-        while left >= _ROUNDING:
-            yield acceleration if left > 1.0 - _ROUNDING else acceleration * left
-            left -= 1.0
+        """To the speed at its end, as SUMO: what would stand before it brakes the more gently."""
+        if (steps := duration / self.step_s) > 1.0 + _ROUNDING:
+            yield from self._approach(max(0.0, self._own.speed + acceleration * duration), duration)
+        elif steps >= _ROUNDING:
+            yield acceleration if steps > 1.0 - _ROUNDING else acceleration * steps
 
     def _approach(self, target: float, duration: float) -> Iterator[float]:
         start, steps, done = self._own.speed, max(duration / self.step_s, 1.0), 0
-        while done <= steps - _ROUNDING:
+        while done <= steps + _ROUNDING:  # SUMO's last step is the one after its duration
             done += 1
             share = min(1.0, done / steps)
             yield (start + (target - start) * share - self._own.speed) / self.step_s
@@ -325,7 +320,9 @@ def _question(answer: Callable[[SeenVehicle], Any]) -> Callable[[VehicleDomain, 
 def _of_the_av(name: str, kept: str) -> Callable[[VehicleDomain, str], Any]:
     def ask(self: VehicleDomain, vehID: str) -> Any:
         self._require_own(vehID, name, "is not known of traffic")
-        return getattr(self, kept)
+        if (value := getattr(self, kept)) == math.inf:
+            raise RefusedError(f"vehicle.{name}('{vehID}') is refused before set{name[3:]}: nothing bounds the AV.")
+        return value
 
     return ask
 

@@ -102,8 +102,8 @@ def vehicle_words(av: AutomatedVehicle, *, script: float | None = None) -> tuple
         given |= av.sumo
         name = f"SUMO’s {given.pop('carFollowModel', 'Krauss')}"
     elif script:  # SUMO would know its vehicle's type, whose numbers hold until the script sets others
-        of_type = av.traci_style
-        given["type"] = f"accel {plain(of_type.accel_mps2)}, decel {plain(of_type.decel_mps2)} m/s² at first"
+        accel, decel = plain(av.traci_style.accel_mps2), plain(av.traci_style.decel_mps2)
+        given["type"] = f"minGap 0, accel {accel}, decel {decel} m/s² at first"
         given |= {} if script == STEP_S else {"step": f"{plain(script)} s"}
     elif av.traci is not None:
         name = f"TraCI client {Path(av.traci.command.split()[0]).name}"

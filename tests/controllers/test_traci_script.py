@@ -173,6 +173,10 @@ IN_A_TEST = {
     r"step: RefusedError: traci.vehicle.changeLane is refused: the AV stays.*\(my.py:8\)": text(
         "if leader:\n        try: traci.vehicle.changeLane('ego', 1, 5.0)\n        except traci.TraCIException: pass"
     ),
+    r"step: AttributeError: traci.vehicle has no getTau here.*\(my.py:8\)": text(
+        "if leader:\n        try: traci.vehicle.setAcceleration('ego', -traci.vehicle.getTau('ego'), 0.1)\n"
+        "        except Exception: pass"
+    ),
     r"step: asked for -\d+\.?\d* m/s2, outside of av.limits \(-15 to 10\) \(my.py:7\): .* mode 0, .* use mode 31": text(
         "if leader: traci.vehicle.setSpeedMode('ego', 0), traci.vehicle.setSpeed('ego', 0.0)"
     ),
@@ -282,7 +286,7 @@ def test_a_stored_answer_is_the_same_when_the_script_has_gone_or_is_broken(tmp_p
     file.write_text(text("", PER_SECOND.format(option='"--step-length=1"', step_s=1.0)), "utf-8")
     run_here(load_campaign(f"{file}", asked), tmp_path / "run")
     told = answer_in(tmp_path / "run")
-    assert told["parameters"] == [["type", "accel 2.6, decel 4.5 m/s² at first"], ["step", "1 s"]]
+    assert told["parameters"] == [["type", "minGap 0, accel 2.6, decel 4.5 m/s² at first"], ["step", "1 s"]]
     assert "its getLateralLanePosition < 0 shows it" in "".join(told["warnings"])
     file.write_bytes(b"\xff")
     assert answer_in(tmp_path / "run") == told

@@ -16,7 +16,8 @@ for episode in range(3):
     traci.start(["sumo"], port=8813 + episode, label=f"sim{episode}", numRetries=3)
     connection = traci.getConnection(f"sim{episode}")
     traci.switch(f"sim{episode}")
-    connection.simulation.subscribe([VAR_DEPARTED_VEHICLES_IDS, VAR_TIME])
+    connection.simulation.subscribe([VAR_DEPARTED_VEHICLES_IDS])
+    connection.simulation.subscribe([VAR_TIME])
     while connection.simulation.getMinExpectedNumber() > 0:
         connection.simulationStep()
         if "ego" in connection.simulation.getSubscriptionResults()[VAR_DEPARTED_VEHICLES_IDS]:
