@@ -67,7 +67,7 @@ def drive(name: str, av: dict[str, object], method: Method, n: int) -> Populatio
         nade.add(block)
         parts.append(np.exp(block.log_weight[block.crash]))
     weights = np.concatenate(parts)
-    return Population(f"{name}, `{method}`", weights, len(weights) / n, nade.y.mean(nade.n), nade.known_cap())
+    return Population(f"{name}, `{method}`", weights, len(weights) / n, nade.y.mean(nade.n), nade.cap()[0])
 
 
 def fixed(population: Population, n: int, replications: int) -> str:

@@ -40,8 +40,8 @@ def note(key: str, **numbers: Any) -> Note:
 IntervalKind = Literal["clopper_pearson", "normal", "skewed", "likelihood_ratio"]
 BoundKind = Literal["one_sided", "two_sided", "hoeffding"]
 """An interval's own limit, one-sided or as its upper end is; or Hoeffding's, of a mean of capped values."""
-CapKind = Literal["design", "tests", "seen_events", "seen", "none"]
-"""What a cap rests on: the design, the tests driven, or only the largest weight seen, among tests with an event."""
+CapKind = Literal["design", "tests", "none"]
+"""What a cap rests on: the design, or the tests driven."""
 
 
 @dataclass(frozen=True)

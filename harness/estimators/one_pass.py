@@ -41,7 +41,7 @@ ACCUMULATORS: dict[EstimatorName, Callable[[], Accumulator]] = {
     "nade": Nade,
     "mixture_cv": MixtureCv,
     "dr": DoublyRobust,
-    "scv": partial(Scv, leave_one_out=True),
+    "scv": Scv,
     "shells": SeenShells,
 }
 SPACING = 1.01

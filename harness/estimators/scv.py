@@ -23,7 +23,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -37,11 +36,6 @@ from harness.vocabulary import FloatArray
 MAX_COLUMNS = 729
 """Most columns of one stratum: J = 3 reaches 2^9 = 512, J = 4 3^6 = 729 at six steps, and uses no more steps then."""
 CHUNK_ROWS = 2_048
-MOST_LEFT_OUT = 2 * CHUNK_ROWS
-"""Tests of a stratum up to which each is left out in turn; larger ones have 511 columns at most, and a mean leverage of
-an eighth, which stands for that of every test then."""
-LEVERAGE = 1.0 - 1e-9
-"""Leverage above which a test is fitted by itself alone: the others say nothing of it but their mean."""
 _ROWS_AT_ONCE = 4096
 
 
@@ -105,11 +99,10 @@ def _regression(factor: FloatArray, n: int) -> tuple[FloatArray, int, float]:
 
 
 class Scv(Nade):
-    """One `Stratum` per number of control steps; leaving tests out in turn takes as long as all else of a result."""
+    """One `Stratum` per number of control steps."""
 
-    def __init__(self, *, leave_one_out: bool = False) -> None:
+    def __init__(self) -> None:
         super().__init__()
-        self._leave_one_out = leave_one_out
         self._strata: dict[int, Stratum] = {}
 
     def add(self, block: Block) -> None:
@@ -154,25 +147,19 @@ class Scv(Nade):
         )  # fmt: skip
 
     def _gain(self, levels: Sequence[int], fits: Sequence[StratumFit], between: float) -> dict[str, Any]:
-        """NADE's variance over that of adjusted results, in all and by stratum: as claimed, and as corrected."""
+        """NADE's variance over that of adjusted results, as claimed and as corrected, and saturated strata."""
         before = math.fsum(fit.total_squares for fit in fits) + between
         squares = [fit.squares() for fit in fits]
         return {
             **{key: _ratio(before, between + math.fsum(one[key] for one in squares)) for key in squares[0]},
             "saturated": [level for level, fit in zip(levels, fits, strict=True) if fit.is_saturated],
-            "rank_deficient": [level for level, fit in zip(levels, fits, strict=True) if fit.is_rank_deficient],
-            "strata": [
-                {"n_control_steps": level}
-                | {key: None if fit.is_saturated else _ratio(fit.total_squares, left) for key, left in one.items()}
-                for level, fit, one in zip(levels, fits, squares, strict=True)
-            ],
         }
 
     def fits(self, tests_each: Sequence[int] = (1,)) -> list[tuple[int, StratumFit]]:
         """Every number of control steps with its regression."""
         levels = sorted(self._strata)
-        fit = partial(Stratum.fit, leave_one_out=self._leave_one_out, tests_each=tests_each)
-        fits = side_by_side(lambda level: fit(self._strata[level]), levels, worthwhile=self.n >= CHUNK_ROWS)
+        large = self.n >= CHUNK_ROWS
+        fits = side_by_side(lambda level: self._strata[level].fit(tests_each), levels, worthwhile=large)
         return list(zip(levels, fits, strict=True))
 
 
@@ -180,8 +167,7 @@ class StratumFit(NamedTuple):
     """Regression of Y_l on H_l: episodes, columns, rank of the centred columns, η_l, Σ(Z - η_l)² and Σ(Y - η_l)².
 
     ``means`` (d,) are of the columns, ``beta`` (k, d) of as many of their largest principal components as leave so many
-    tests to each. ``left_out_squares`` is the sum of squared errors of each Y as the regression on the other tests
-    predicts it; NaN where that was not asked for.
+    tests to each.
     """
 
     n: int
@@ -192,29 +178,20 @@ class StratumFit(NamedTuple):
     total_squares: float
     means: FloatArray
     beta: FloatArray
-    left_out_squares: float
 
     @property
     def is_saturated(self) -> bool:
         """Whether any results would be fitted: as many independent columns as there are tests, but for their mean."""
         return 0 < self.rank >= self.n - 1
 
-    @property
-    def is_rank_deficient(self) -> bool:
-        """Whether columns depend on each other, though there are tests enough to tell them apart."""
-        return self.rank < min(self.n_columns, self.n - 1)
-
     def squares(self) -> dict[str, float]:
-        """Σ(Z - η_l)² as claimed; free of what a fit explains by chance; and of tests that the fit has not seen.
+        """Σ(Z - η_l)² as claimed, and free of what a fit explains by chance.
 
         A saturated stratum says nothing of what columns explain: its results count as they are, with Σ(Y - η_l)².
         """
-        n, free = self.n, self.n - self.rank - 1
-        fair, unseen = self.total_squares, self.total_squares
-        if free > 0:
-            fair = self.residual_squares * (n - 1) / free
-            unseen = self.left_out_squares * ((n - 1) / n) ** 2  # a mean, too, is farther from what it has not seen
-        return {"claimed": self.residual_squares, "degrees_of_freedom": fair, "leave_one_out": unseen}
+        free = self.n - self.rank - 1
+        fair = self.residual_squares * (self.n - 1) / free if free > 0 else self.total_squares
+        return {"claimed": self.residual_squares, "degrees_of_freedom": fair}
 
 
 def _ratio(before: float, after: float) -> float | None:
@@ -234,7 +211,6 @@ class Stratum:
         self._level, self._n = level, 0
         self._factor: FloatArray | None = None
         self._rows: list[tuple[FloatArray, FloatArray]] = []
-        self._n_folded = 0
 
     def add(self, first_ratios: FloatArray, y: FloatArray) -> None:
         """Add episodes of this stratum: ratios, shape (m, 9, J), and Y, shape (m,)."""
@@ -243,37 +219,32 @@ class Stratum:
             self._rows.append(part)
             self._n += len(part[1])
             if self._n % CHUNK_ROWS == 0:
-                self._factor = fold_rows(self._factor, self._waiting_rows())
-                self._n_folded = len(self._rows)
-        if self._n > MOST_LEFT_OUT:  # only those that wait are needed again
-            del self._rows[: self._n_folded]
-            self._n_folded = 0
+                self._factor, self._rows = self._folded(), []
 
-    def _waiting_rows(self) -> FloatArray:
-        return self._expanded(*map(np.concatenate, zip(*self._rows[self._n_folded :], strict=True)))
-
-    def _expanded(self, first_ratios: FloatArray, y: FloatArray) -> FloatArray:
-        """Rows [1, H, Y], shape (m, d + 2), in Fortran order."""
+    def _folded(self) -> FloatArray:
+        """Triangular factor with all rows that wait: [1, H, Y], shape (m, d + 2), in Fortran order."""
+        if not self._rows and self._factor is not None:
+            return self._factor
+        first_ratios, y = map(np.concatenate, zip(*self._rows, strict=True))
         rows = np.empty((len(first_ratios), n_columns(self._level, first_ratios.shape[2]) + 2), order="F")
         rows[:, 0], rows[:, -1] = 1.0, y
         fill_product_columns(first_ratios, self._level, rows[:, 1:-1])
-        return rows
+        return fold_rows(self._factor, rows)
 
-    def fit(self, *, leave_one_out: bool = False, tests_each: Sequence[int] = (1,)) -> StratumFit:
+    def fit(self, tests_each: Sequence[int] = (1,)) -> StratumFit:
         """Solve the regression by SVD of the centred columns' triangular factor.
 
         The tolerance for the rank is machine epsilon times the larger dimension times the largest singular value, as
         is customary, or times √n_l·|(1, means of the columns)| if larger, the norm of what centring has taken away:
         else rounding errors of columns that never vary would be fitted.
         """
-        if (factor := self._factor) is None or len(self._rows) > self._n_folded:
-            factor = fold_rows(factor, self._waiting_rows())
+        factor = self._folded()
         intercept, means = float(factor[0, -1] / factor[0, 0]), factor[0, 1:-1] / factor[0, 0]
         last = factor.shape[1] - 1
         centred, target = factor[1:last, 1:last], factor[1:last, last]
         residual_squares = float(factor[last, last] ** 2) if len(factor) > last else 0.0
         total_squares = residual_squares + float(np.sum(target**2))
-        rank, root, explained, beta = 0, np.zeros((last - 1, 0)), np.zeros(0), np.zeros((len(tests_each), last - 1))
+        rank, beta = 0, np.zeros((len(tests_each), last - 1))
         if centred.size:
             left, singular, right = np.linalg.svd(centred, full_matrices=False)
             largest = max(singular[0], np.linalg.norm(factor[0, :-1]))
@@ -283,22 +254,7 @@ class Stratum:
             root, explained = right[kept].T / singular[kept], left[:, kept].T @ target
             most = [self._n // each for each in tests_each]
             beta = np.array([root[:, :k] @ explained[:k] for k in most])
-        fit = StratumFit(self._n, last - 1, rank, intercept, residual_squares, total_squares, means, beta, math.nan)
-        return fit._replace(left_out_squares=self._left_out(fit, root, explained)) if leave_one_out else fit
-
-    def _left_out(self, fit: StratumFit, root: FloatArray, explained: FloatArray) -> float:
-        """Sum of squared errors of each Y as the regression on the other tests predicts it: (Z - η)/(1 - leverage)."""
-        n, total = self._n, 0.0
-        if n > MOST_LEFT_OUT:
-            return fit.residual_squares * (n / (n - fit.rank - 1)) ** 2
-        for part in self._rows if n > 1 else ():
-            rows = self._expanded(*part)
-            scores = (rows[:, 1:-1] - fit.means) @ root
-            leverage, away = 1.0 / n + np.sum(scores**2, axis=1), rows[:, -1] - fit.intercept
-            alone = leverage > LEVERAGE
-            errors = (away - scores @ explained) / np.where(alone, 1.0, 1.0 - leverage)
-            total += float(np.sum(np.where(alone, away * (n / (n - 1)), errors) ** 2))
-        return total
+        return StratumFit(self._n, last - 1, rank, intercept, residual_squares, total_squares, means, beta)
 
 
 def steps_used(n_control_steps: int, n_surrogates: int) -> int:

@@ -124,7 +124,6 @@ class SeenShells:
         self.tally = self.cells = empty_tally(0)
         if design is not None:
             self.design, self.cells, self.tally = design, empty_tally(design.cell_p.size), empty_tally(design.p.size)
-        self._known: dict[tuple[int, int, Level], RateLimits] = {}  # of strata between two numbers
         self._on_runs: list[CrashedTests] = []
         self._crashed: dict[int, list[int]] = {}  # stratum → its first few tests that crashed
 
@@ -157,7 +156,6 @@ class SeenShells:
             tests = CrashedTests(*map(np.concatenate, zip(*self._on_runs, strict=True)))
             self.cells = self.cells._replace(runs=OnRuns.of(design.n_paths, design.cell_p.size, tests))
         self.tally = self.cells.joined(design.joined)
-        self._known.clear()
 
     def add(self, block: Block) -> None:
         """Count one block."""
@@ -278,20 +276,18 @@ class SeenShells:
 
     def _limits(self, end: int, level: Level, begin: int = 0) -> RateLimits:
         """Of strata ``begin … end - 1``; anything is possible where crashes lie on too few paths."""
-        if (key := (begin, end, level)) not in self._known:
-            p, tally = self.design.p[begin:end], self.tally.part(slice(begin, end))
-            found = RateLimits(tally.rate(p), 0.0, 1.0, math.inf, math.inf)
-            if not (few := paths_that_count(p, tally) < FEWEST_PATHS):
-                found = combined(p, tally, self.design.n_independent, level)
-                if paths_that_count(p, tally.failed_as_crashes()) < FEWEST_PATHS:
-                    found = found._replace(high=1.0)
-            testable = np.resize(self.design.available[begin:end] or 1, p.size) > 0
-            # Crashes of strata that are still to be tested may lie on other paths.
-            to_come = tally.runs is not None and bool((tally.tests[testable] == 0).any())
-            if to_come or (few and paths_that_count(p, tally, -ROOM) >= FEWEST_PATHS):
-                found = found._replace(from_pool_at_least=0.0)
-            self._known[key] = found
-        return self._known[key]
+        p, tally = self.design.p[begin:end], self.tally.part(slice(begin, end))
+        found = RateLimits(tally.rate(p), 0.0, 1.0, math.inf, math.inf)
+        if not (few := paths_that_count(p, tally) < FEWEST_PATHS):
+            found = combined(p, tally, self.design.n_independent, level)
+            if paths_that_count(p, tally.failed_as_crashes()) < FEWEST_PATHS:
+                found = found._replace(high=1.0)
+        testable = np.resize(self.design.available[begin:end] or 1, p.size) > 0
+        # Crashes of strata that are still to be tested may lie on other paths.
+        to_come = tally.runs is not None and bool((tally.tests[testable] == 0).any())
+        if to_come or (few and paths_that_count(p, tally, -ROOM) >= FEWEST_PATHS):
+            found = found._replace(from_pool_at_least=0.0)
+        return found
 
     def _cautions(self) -> tuple[Note, ...]:
         n_paths, n = self.design.n_paths, paths_that_count(self.design.p, self.tally)

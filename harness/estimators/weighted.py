@@ -111,7 +111,6 @@ class Nade:
         self.n = self.n_crashes = 0
         self.y = Moments()
         self._largest_y = self._design_cap = self._log_cap = -math.inf
-        self._largest_log_weight = self._largest_event_log_weight = -math.inf
 
     def add(self, block: Block) -> None:
         """Add the episodes of one block."""
@@ -120,9 +119,6 @@ class Nade:
         self.n_crashes += len(weights)
         self.y += Moments.of(weights)
         self._largest_y = float(np.max(weights, initial=self._largest_y))
-        self._largest_log_weight = float(np.max(block.log_weight, initial=self._largest_log_weight))
-        of_events = block.log_weight[block.happened]
-        self._largest_event_log_weight = float(np.max(of_events, initial=self._largest_event_log_weight))
         self._design_cap = max(self._design_cap, math.inf if (cap := block.drawn.weight_cap) is None else cap)
         self._log_cap = max(self._log_cap, block.log_cap())
 
@@ -130,23 +126,17 @@ class Nade:
         """Largest Y as a share of ΣY, 0 without a crash."""
         return self._largest_y / self.y.total if self.y.total > 0.0 else 0.0
 
-    def known_cap(self) -> float:
-        """Largest Y that the tests could have had, whatever the AV does; infinite where nothing bounds it.
+    def cap(self) -> tuple[float, CapKind]:
+        """Largest Y that the tests could have had, whatever the AV does, and what that rests on: else infinite.
 
         Where the design has none it is taken over all tests driven (`Block.log_cap`), the few that ended in a crash and
         the many that did not.
         """
-        of_tests = math.exp(self._log_cap) if self._log_cap < LARGEST_LOG else math.inf
-        return max(self._design_cap if math.isfinite(self._design_cap) else of_tests, self._largest_y)
-
-    def cap(self) -> tuple[float, CapKind]:
-        """Cap on Y for the upper bound, and what it rests on."""
-        known = self.known_cap()
-        if math.isfinite(known):
-            return known, "design" if math.isfinite(self._design_cap) else "tests"
-        of_events = math.isfinite(self._largest_event_log_weight)
-        seen = self._largest_event_log_weight if of_events else self._largest_log_weight
-        return math.exp(seen) if seen < LARGEST_LOG else math.inf, "seen_events" if of_events else "seen"
+        if math.isfinite(self._design_cap):
+            return max(self._design_cap, self._largest_y), "design"
+        if self._log_cap < LARGEST_LOG:
+            return max(math.exp(self._log_cap), self._largest_y), "tests"
+        return math.inf, "none"
 
     def is_settled(self) -> bool:
         """Whether there are enough crashes for limits from moments to mean what they say."""
@@ -160,7 +150,7 @@ class Nade:
         found = []
         if math.isfinite(self._design_cap) and self._largest_y > self._design_cap * (1.0 + 1e-9):
             found.append(note("contradicts_design", weight=self._largest_y, cap=self._design_cap))
-        cap = self.known_cap()
+        cap, _ = self.cap()
         if not math.isfinite(cap):
             found.append(note("unbounded"))
         elif self.n_crashes and (times := cap / self.y.total) > OVERTURNS:
@@ -170,13 +160,13 @@ class Nade:
 
     def warnings(self, half_width: float) -> list[Note]:
         """What else a reader of a mean of these Y should know, beside an interval of this half-width."""
-        found, effective, cap = self._few_crashes(), self.y.n_effective, self.known_cap()
+        found, effective, (cap, origin) = self._few_crashes(), self.y.n_effective, self.cap()
         if 0.0 < effective < FEW_EFFECTIVE:
             found.append(note("few_effective", n=effective, least=FEW_EFFECTIVE))
         if self.largest_share() > LARGE_SHARE:
             found.append(note("one_carries", share=self.largest_share()))
-        if not math.isfinite(self._design_cap) and not self.is_settled():
-            found.append(note("bound_rests", cap=self.cap()[1]))
+        if origin == "tests" and not self.is_settled():
+            found.append(note("bound_rests", cap=origin))
         if 0.0 < half_width < cap / self.n <= OVERTURNS * self.y.mean(self.n):  # beyond that there is a caution
             found.append(note("one_more_moves", cap=cap, by=cap / self.n))
         return found
@@ -222,7 +212,7 @@ class Nade:
             rhw=half / rate if rate > 0.0 else math.inf, n_episodes=self.n, n_crashes=self.n_crashes,
             confidence=confidence, n_effective=self.y.n_effective, largest_weight_share=self.largest_share(),
             interval="normal" if third_moment is None else "skewed", bound="one_sided" if settled else "hoeffding",
-            cap=origin, weight_cap=self.known_cap(), cautions=cautions,
+            cap=origin, weight_cap=cap, cautions=cautions,
             warnings=(*cautions, *self.warnings(half), *warnings),
             details={"upper_bound_hoeffding": hoeffding, **(details or {})},
         )  # fmt: skip

@@ -134,8 +134,6 @@ class Pool:
         surrogates = zip(self.names, self.mu.tolist(), error.tolist(), p[:-1], strict=True)
         references = zip(self.library.references, self.reference_rate.tolist(), reference_error.tolist(), strict=True)
         keys = "name", "crash_rate", "std_error", "shell_probability"
-        drivers = self.library.surrogates.items()
-        delays = {name: delay for name, each in drivers if (delay := each.delay_after_event_s) is not None}
         return {
             "pool": self.key,
             "n_paths": self.n_paths,
@@ -143,7 +141,6 @@ class Pool:
             "p_event_std_error": self.p_event_se,
             "boundary": self.library.boundary,
             "envelope": self.library.envelope,
-            "delays_after_event_s": {} if self.events.lead.any() else delays,
             "surrogates": [dict(zip(keys, row, strict=True)) for row in surrogates],
             "no_surrogate_crashes": p[-1],
             "references": [dict(zip(keys[:-1], row, strict=True)) for row in references],

@@ -34,8 +34,6 @@ BOUNDS: Mapping[BoundKind, str] = {
 CAPS: Mapping[CapKind, str] = {
     "design": "the weight cap known by design",
     "tests": "the largest weight that the tests driven could have had",
-    "seen_events": "the largest weight seen among tests with an event (no cap is known)",
-    "seen": "the largest weight seen (no cap is known)",
     "none": "no cap",
 }
 

@@ -29,8 +29,8 @@ from studies.work import write_table
 class Claims:
     """Both estimators, fed with the same blocks; SCV only where it is defined and wanted."""
 
-    def __init__(self, *, with_scv: bool = True, leave_one_out: bool = False) -> None:
-        self.nade, self.scv, self._with_scv = Nade(), Scv(leave_one_out=leave_one_out), with_scv
+    def __init__(self, *, with_scv: bool = True) -> None:
+        self.nade, self.scv, self._with_scv = Nade(), Scv(), with_scv
         self._weight = 0.0
 
     def add(self, block: Block) -> None:
@@ -62,10 +62,10 @@ class Claims:
             row[f"{name}_rhw"] = half / rate if rate > 0.0 else None
             needed = figures.tests_for(self.nade.n * (half / z / rate) ** 2, rhw, confidence) if rate > 0.0 else None
             row[f"{name}_tests"] = needed
-        row |= dict.fromkeys(("gain_claimed", "gain_degrees_of_freedom", "gain_leave_one_out", "difference"))
+        row |= dict.fromkeys(("gain_claimed", "gain_degrees_of_freedom", "difference"))
         row["n_saturated"] = 0 if scv is None else len(scv.details["gain"]["saturated"])
         if scv is not None and scv.std_error > 0.0 < nade.crash_rate:
-            row |= {f"gain_{key}": scv.details["gain"][key] for key in ("degrees_of_freedom", "leave_one_out")}
+            row["gain_degrees_of_freedom"] = scv.details["gain"]["degrees_of_freedom"]
             row["gain_claimed"] = (nade.std_error / scv.std_error) ** 2
             row["difference"] = abs(scv.crash_rate / nade.crash_rate - 1.0)
         return row
@@ -77,7 +77,7 @@ def compare_control_variates(step: ControlVariates, context: Context) -> dict[st
     shown = [size for size in step.sizes if size <= n]
     between = np.geomspace(min(300, shown[-1]), shown[-1], step.looks) if shown else np.zeros(0)
     sizes = sorted({*shown, *between.astype(int).tolist()})
-    claims, rows = Claims(leave_one_out=True), list[dict[str, Any]]()
+    claims, rows = Claims(), list[dict[str, Any]]()
     context.progress.stage("both estimates", max(sizes, default=0))
     for block in rnot.cut_at(stored_blocks(run, moments=True), sizes):
         claims.add(block)

@@ -153,11 +153,7 @@ def strata_plot(strata: list[dict[str, Any]]) -> Plot | None:
     return _drawn(figure, f"By control steps: {columns}; spread of results of NADE (Y) and of SCV (Z).")
 
 
-_GAINS = {
-    "claimed": ("as claimed", _COLOURS["scv"]),
-    "degrees_of_freedom": ("by degrees of freedom", INK),
-    "leave_one_out": ("leaving one out", GREEN),
-}
+_GAINS = {"claimed": ("as claimed", _COLOURS["scv"]), "degrees_of_freedom": ("by degrees of freedom", INK)}
 
 
 def growth_plot(result: Mapping[str, Any], rhw: float) -> Plot | None:
@@ -170,7 +166,7 @@ def growth_plot(result: Mapping[str, Any], rhw: float) -> Plot | None:
     for key, label, width in (("nade", "NADE", 4.0), ("scv", "SCV, as it claims", 1.4)):
         values = [row[f"{key}_rhw"] for row in known]
         left.plot(n, values, "o-", label=label, color=_COLOURS[key], linewidth=width, markersize=3)
-    caption = "By tests: relative half-widths; SCV's gain as claimed, corrected in two ways, and replicated."
+    caption = "By tests: relative half-widths; SCV's gain as claimed, corrected, and replicated."
     for key, (label, colour) in _GAINS.items():
         gains = np.array([row[f"gain_{key}"] or np.nan for row in known])
         below = gains < LEAST_GAIN

@@ -49,20 +49,23 @@ def test_where_every_test_has_crashed_some_might_not_have():
     assert estimate.rhw == pytest.approx(0.5 * (1.0 - 0.05 ** (1 / 20)))
 
 
-def test_the_cap_comes_from_the_design_then_from_the_paths_then_from_weights():
+def test_the_cap_comes_from_the_design_or_from_the_paths():
     some, paths = ([True, False], [-7.0, 0.0]), np.log([1e-3, 2e-3])
     known = nade(block(*some, method="forced", weight_cap=5e-3, log_p_event=paths))
     driven = nade(block(*some, method="forced", log_p_event=paths))
     mixed = nade(block(*some, method="episode_mixture", alpha=np.array([0.1, 0.9]), log_p_event=paths))
-    seen = nade(block(*some, method="step_mixture"))
+    unknown = nade(block(*some, method="step_mixture"))
     assert known.cap() == (5e-3, "design")
     assert driven.cap()[0] == pytest.approx(2e-3)
     assert mixed.cap()[0] == pytest.approx(2e-3 / 0.1)  # over the defensive share
-    assert seen.cap()[0] == pytest.approx(math.exp(-7.0))
+    assert unknown.cap() == (math.inf, "none")
     assert not any("upper bound rests" in note_words(w) for w in known.result(0.9).warnings)
-    for unknown in (driven, seen):
-        assert any("upper bound rests" in note_words(w) for w in unknown.result(0.9).warnings)
-        assert (unknown.result(0.9).bound, unknown.result(0.9).cap) == ("hoeffding", unknown.cap()[1])
+    assert any("upper bound rests" in note_words(w) for w in driven.result(0.9).warnings)
+    assert [(each.result(0.9).bound, each.result(0.9).cap) for each in (driven, unknown)] == [
+        ("hoeffding", "tests"),
+        ("hoeffding", "none"),
+    ]
+    assert unknown.result(0.9).upper_bound == 1.0
 
 
 @pytest.mark.parametrize(

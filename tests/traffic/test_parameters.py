@@ -80,6 +80,7 @@ def lateral(**numbers):
     return TEXT + "lateral:\n" + "".join(lines)
 
 
+SIDEWAYS = {"distance_m": 1.7, "speed_median_mps": 0.7, "speed_log_sd": 0.3}
 RANGED = {"value": 1.0, "source": "user"}
 REFUSED = [
     *((changed(("cut_in", "ignore_share", text)), "cut_in.ignore_share.value") for text in ["7", *NOT_NUMBERS]),
@@ -95,10 +96,9 @@ REFUSED = [
     (changed(("initial_state", "r1_shift_m", "300")), "initial_state.r1_*"),
     (changed(("initial_state", "r1dot_log_scale", "5")), "initial_state.r1dot_*"),
     (changed(("free_driving", "log_scale", "-20")), "noise of scale"),
-    (lateral(distance_m=1.7), ": found neither; expected lead_s alone"),
-    (lateral(distance_m=1.7, lead_s=1.0, speed_median_mps=0.7), ": found lead_s, speed_median_mps; expected"),
-    (lateral(distance_m=1.7, lead_s=0.55), "lateral.lead_s.value"),
-    (lateral(distance_m=0.0, lead_s=0.5), "lateral.distance_m.value"),
+    (lateral(distance_m=1.7, speed_log_sd=0.3, longest_lead_s=4.0), "lateral.speed_median_mps"),
+    (lateral(**SIDEWAYS, longest_lead_s=0.55), "lateral.longest_lead_s.value"),
+    (lateral(**SIDEWAYS | {"distance_m": 0.0}, longest_lead_s=4.0), "lateral.distance_m.value"),
     (tabled(acceptance_steps__share=of([0.5] * 5)), "acceptance_steps.share"),
     (tabled(acceptance_steps__share=of([0.0] * 6)), "acceptance_steps.share.0.value"),
     (tabled(acceptance_steps__events=[1, 2]), "acceptance_steps.events"),

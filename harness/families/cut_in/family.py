@@ -40,8 +40,6 @@ MANEUVER_FACTS = (
 DISTANCE_SEED = DISTANCE_PATHS = 20_000
 """Paths over which the mean distance of a test is taken; its standard error is below 0.5 %. Tests with a cut-in are too
 few (some 3e-5 at level 1) to matter."""
-_DISTANCES: dict[str, float] = {}
-"""What has been found of environments, by their digest: each run asks for it."""
 
 _COUNTED = (
     "cut-ins that begin at more than 5 m/s of closing speed and 22.2 m/s or more, in the trajectories of de Gelder et "
@@ -101,11 +99,9 @@ class CutIn(Family):
         return traffic.lateral.present
 
     def mean_distance_m(self, traffic: Environment) -> float:
-        if (key := self.digest(traffic)) not in _DISTANCES:
-            states = InitialStates(traffic.numbers).draw(DISTANCE_SEED, 0, DISTANCE_PATHS)
-            scratch = empty_trajectory(traffic)
-            _DISTANCES[key] = float(mean_test_distance(DISTANCE_SEED, states, unboxed(traffic), unboxed(scratch)))
-        return _DISTANCES[key]
+        states = InitialStates(traffic.numbers).draw(DISTANCE_SEED, 0, DISTANCE_PATHS)
+        scratch = empty_trajectory(traffic)
+        return float(mean_test_distance(DISTANCE_SEED, states, unboxed(traffic), unboxed(scratch)))
 
     def mean_speed_mps(self, traffic: Environment) -> float:
         states = InitialStates(traffic.numbers).draw(DISTANCE_SEED, 0, DISTANCE_PATHS)

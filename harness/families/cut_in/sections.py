@@ -5,14 +5,14 @@ from __future__ import annotations
 import math
 from collections.abc import Collection, Mapping
 from itertools import pairwise
-from typing import Annotated, Any, Self
+from typing import Annotated, Any
 
 import numpy as np
 from pydantic import AfterValidator, BaseModel, Field, model_validator
 from scipy.special import gammainc, gammaincinv
 
 from harness.campaign.sections import Section
-from harness.families.cut_in.lateral import LateralMotion, constant_lead, log_normal_speed
+from harness.families.cut_in.lateral import LateralMotion, log_normal_speed
 from harness.families.cut_in.laws import Wish
 from harness.families.numbers import (
     Acceleration,
@@ -37,13 +37,11 @@ from harness.numbers import plain
 from harness.problems import broken_rule
 from harness.vocabulary import FloatArray
 
-LONGEST_LEAD_S = 10.0
 SMALLEST_SHARE = 1e-12
 """Of lane changes that are accepted."""
 STEP = "acceptance_steps__share__"
 ONE_SIDED = 0.95
 """Quantile of a step's share that no replicate has drawn."""
-_SPEED = ("speed_median_mps", "speed_log_sd", "longest_lead_s")
 HAZARD_OF = {"v_mps": "v_log", "r1_m": "r1_log", "r1dot_mps": "r1dot_log"}
 """What the hazard of cut-ins depends on, and the names of its effects."""
 
@@ -243,28 +241,17 @@ def _values(numbers: list[Number]) -> list[float]:
 
 
 class Lateral(Section):
-    """How long cut-ins show themselves before BV overlaps: a constant lead, or a log-normal lateral speed."""
+    """How long cut-ins show themselves before BV overlaps: by a log-normal lateral speed, and at most the longest."""
 
     distance_m: Annotated[Number, within(0.1, 5.0)]
-    lead_s: Annotated[Number, within(0.0, LONGEST_LEAD_S), AfterValidator(in_whole_steps)] | None = None
-    speed_median_mps: Annotated[Number, within(0.05, 20.0)] | None = None
-    speed_log_sd: Annotated[Number, within(0.01, 3.0)] | None = None
-    longest_lead_s: Annotated[Number, within(0.1, LONGEST_LEAD_S), AfterValidator(in_whole_steps)] | None = None
-
-    @model_validator(mode="after")
-    def _one_of_both(self) -> Self:
-        named = tuple(name for name in ("lead_s", *_SPEED) if getattr(self, name) is not None)
-        if named not in (("lead_s",), _SPEED):
-            mend = "A lead is constant, or follows from a lateral speed and is cut off at the longest."
-            raise broken_rule("", ", ".join(named) or "neither", f"lead_s alone, or {', '.join(_SPEED)}", mend)
-        return self
+    speed_median_mps: Annotated[Number, within(0.05, 20.0)]
+    speed_log_sd: Annotated[Number, within(0.01, 3.0)]
+    longest_lead_s: Annotated[Number, within(0.1, 10.0), AfterValidator(in_whole_steps)]
 
     def motion(self) -> LateralMotion:
         """As kernels read it."""
-        if self.lead_s is not None:
-            return constant_lead(self.lead_s.value, self.distance_m.value)
-        median, log_sd, longest = (getattr(self, name).value for name in _SPEED)
-        return log_normal_speed(self.distance_m.value, median, log_sd, longest)
+        median, log_sd, longest = self.speed_median_mps, self.speed_log_sd, self.longest_lead_s
+        return log_normal_speed(self.distance_m.value, median.value, log_sd.value, longest.value)
 
 
 class Replicates(Section):
