@@ -214,12 +214,7 @@ class StopRule(Rule):
         return self._n_looks < len(self.looks) and n == self.looks[self._n_looks]
 
     def observe(self, n: int, estimate: Estimate) -> bool:
-        """Whether to stop after the look at `n` episodes, the next of `looks`, with the estimate from exactly these.
-
-        Looks skipped, repeated or taken elsewhere are a `ValueError`: the rule is valid only as declared.
-        """
-        if self.look.stopped or not self.due(n) or estimate.n_episodes != n:
-            raise ValueError(f"no look is due at {n} episodes with an estimate of {estimate.n_episodes}")
+        """Whether to stop after the look at ``n`` episodes, the next of `looks`, with the estimate of exactly these."""
         self._n_looks += 1
         last, total = self._n_looks == len(self.looks), n * estimate.crash_rate
         one_more = estimate.weight_cap / total if total > 0.0 else math.inf

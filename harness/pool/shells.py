@@ -319,11 +319,6 @@ class PrescribedEpisodes:
         rows = [self._order[draw.stratum][draw.first : draw.first + draw.n] for draw in draws]
         return np.concatenate(rows), np.repeat([draw.stratum for draw in draws], [draw.n for draw in draws])
 
-    def tests(self, draws: tuple[Draw, ...]) -> tuple[Traffic, PrescribedEvents]:
-        """Tests (n,), and which events they are."""
-        rows, stratum = self.rows(draws)
-        return self.of_rows(rows, stratum), self.events(rows)
-
     def events(self, rows: IntArray) -> PrescribedEvents:
         """What records say of given events of the pool (n,)."""
         joined = np.eye(len(self.design.cell_stratum) + 1)[self._cells, :-1]  # the last row is for what is not tested

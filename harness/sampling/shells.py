@@ -103,15 +103,15 @@ class Shells(Source):
         return ShellRounds(self.campaign, self.prescribed.design, self.prescribed.available, held)
 
     def run(self, loop: EpisodeLoop, request: ShardRequest) -> Shard:
-        traffic, events = self.prescribed.tests(request.draws)
-        shard = loop.run(request.first_episode, traffic)
-        shard.events = events
-        return shard
+        return self._run(loop, request.first_episode, *self.prescribed.rows(request.draws))
 
     def run_again(self, loop: EpisodeLoop, episode: int, stored: pa.Table) -> Shard:
         row, stratum = (np.asarray(stored[name]).astype(np.int64) for name in ("pool_row", "component"))
-        shard = loop.run(episode, self.prescribed.of_rows(row, stratum))
-        shard.events = self.prescribed.events(row)
+        return self._run(loop, episode, row, stratum)
+
+    def _run(self, loop: EpisodeLoop, first: int, rows: IntArray, stratum: IntArray) -> Shard:
+        shard = loop.run(first, self.prescribed.of_rows(rows, stratum))
+        shard.events = self.prescribed.events(rows)
         return shard
 
     def is_shard(self, request: ShardRequest, episodes: pa.Table) -> bool:

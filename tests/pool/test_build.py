@@ -193,7 +193,8 @@ def test_a_prescribed_episode_ends_as_the_pool_says(lateral, lateral_pool, name)
     """Sixty cut-ins of each stratum."""
     resolved = resolve(lateral)
     prescribed = PrescribedEpisodes(resolved, lateral_pool)
-    traffic, events = prescribed.tests(tuple(Draw(s, 0, 60) for s in range(prescribed.design.p.size)))
+    rows, stratum = prescribed.rows(tuple(Draw(s, 0, 60) for s in range(prescribed.design.p.size)))
+    traffic, events = prescribed.of_rows(rows, stratum), prescribed.events(rows)
     environment, rows = resolved.environment, events.row
     driver = (
         LADDER.followers(environment.lateral.present).drivers[[*NAMES, *LADDER.references].index(name)][None].copy()

@@ -21,7 +21,7 @@ from harness.vehicles.drivers import MOST_FOLLOWERS, Followers
 from harness.vehicles.kinematics import CONTACT_M, STEP_S, VEHICLE_LENGTH_M, gap, next_position, next_speed, overlaps
 from harness.vehicles.references import Memory, react, still_cruises
 from harness.vehicles.sideways import onset_of, perceived_in
-from harness.vocabulary import AV, BV, CONTACT, LV, PASSED, RUNNING, FloatArray, Int8Array, Record, RecordArray
+from harness.vocabulary import AV, BV, LV, FloatArray, Int8Array, Record, RecordArray
 
 AV_START_M = 100.0
 NO_CRASH, WAS_AHEAD, FOLLOWS = -1, -2, -3
@@ -93,17 +93,6 @@ def state_of(x: FloatArray, v: FloatArray) -> State:
 
 
 @compiled_inline
-def end_in(step: int, path: Trajectory) -> int:
-    """How an episode without a cut-in ends in a step that has been walked, or `RUNNING`."""
-    x = path.x[step]
-    if step > 0 and gap(x[LV], x[BV]) < CONTACT_M:
-        return CONTACT
-    if step > 0 and gap(x[BV], x[AV]) <= 0.0:
-        return PASSED
-    return RUNNING
-
-
-@compiled_inline
 def walk(
     state: State, seed: int, episode: int, until: int, ends_passed: bool, environment: Environment, path: Trajectory
 ) -> int:
@@ -114,10 +103,9 @@ def walk(
     hold_steps = environment.numbers.hold_steps
     place(state, path.x[0], path.v[0])
     for step in range(until):
-        end = end_in(step, path)
-        if end == CONTACT or (end == PASSED and ends_passed):
-            return step
         m, x, v, after = step // hold_steps, path.x[step], path.v[step], path.v[step + 1]
+        if step > 0 and (gap(x[LV], x[BV]) < CONTACT_M or (ends_passed and gap(x[BV], x[AV]) <= 0.0)):
+            return step
         if step % hold_steps == 0:
             u_lv, u_bv = uniform(seed, episode, LV_DRAWS, m), uniform(seed, episode, BV_DRAWS, m)
             path.lv[m] = laws.drive_freely(u_lv, v[LV], environment)

@@ -35,17 +35,6 @@ def facts_of(state: RecordArray, maneuvers: Maneuvers) -> RecordArray:
     return facts
 
 
-def states_of(facts: RecordArray) -> RecordArray:
-    """Initial states (n,)."""
-    return states_from(facts[name] for name in STATE_COLUMNS)
-
-
-def maneuvers_of(chosen: Chosen) -> Maneuvers:
-    """Maneuvers of chosen cut-ins (n,)."""
-    lv, bv, n_lv, n_bv = (np.ascontiguousarray(chosen.facts[name]) for name in (*_LENGTHS, *_LENGTHS.values()))
-    return Maneuvers(lv, bv, n_lv, n_bv, chosen.lead)
-
-
 def beginning(state: RecordArray) -> tuple[FloatArray, FloatArray, Int8Array]:
     """Positions (m), speeds (m/s) and lanes (n, 3) of LV, BV and AV in initial states (n,)."""
     columns: Any = state.view(np.recarray)
@@ -59,9 +48,11 @@ def beginning(state: RecordArray) -> tuple[FloatArray, FloatArray, Int8Array]:
 def script_of(traffic: Environment, chosen: Chosen) -> Script:
     """The motion of LV and BV, to the end of the longest test; after its last maneuver BV keeps its speed."""
     facts, n, steps = chosen.facts, len(chosen.facts), int(traffic.numbers["max_steps"])
-    x, v, lane = beginning(states_of(facts))
+    x, v, lane = beginning(states_from(facts[name] for name in STATE_COLUMNS))
+    lv, bv, n_lv, n_bv = (np.ascontiguousarray(facts[name]) for name in (*_LENGTHS, *_LENGTHS.values()))
+    told = unboxed(Maneuvers(lv, bv, n_lv, n_bv, chosen.lead))
     speed, lanes = np.zeros((n, steps, BV + 1)), np.full((n, steps, BV + 1), LEFT, np.int8)
-    _move(unboxed(maneuvers_of(chosen)), chosen.at, int(traffic.numbers["hold_steps"]), v, speed, lanes)
+    _move(told, chosen.at, int(traffic.numbers["hold_steps"]), v, speed, lanes)
     return natural_script(x, v, lane, speed, lanes, chosen.at, chosen.lead)
 
 

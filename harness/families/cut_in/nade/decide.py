@@ -16,6 +16,7 @@ from harness.families.cut_in.nade.challenge import remaining_level
 from harness.families.cut_in.nade.functions import challenges_nobody, look_ahead, propose_acceleration, propose_cut_in
 from harness.families.cut_in.nade.likelihood_ratio import log_mixture, record_acceleration, record_lane
 from harness.families.cut_in.path import state_of, walk, weigh_cut_ins
+from harness.families.cut_in.script import RIGHT
 from harness.families.cut_in.vocabulary import CUT_IN, N_ACCELERATIONS, State
 from harness.loop.cells import KernelState
 from harness.loop.repeat import note_event
@@ -26,7 +27,6 @@ from harness.vocabulary import BV, LV, FloatArray
 
 COMPONENT_DRAW, CUT_IN_DRAW = 0, 1
 """Indices within the cut-in stream."""
-RIGHT = 0
 
 
 @compiled
