@@ -103,7 +103,7 @@ def vehicle_words(av: AutomatedVehicle, *, script: float | None = None) -> tuple
         name = f"SUMO’s {given.pop('carFollowModel', 'Krauss')}"
     elif script:  # SUMO would know its vehicle's type, whose numbers hold until the script sets others
         accel, decel = plain(av.traci_style.accel_mps2), plain(av.traci_style.decel_mps2)
-        given["type"] = f"minGap 0, accel {accel}, decel {decel} m/s² at first"
+        given["type"] = f"accel {accel}, decel {decel}, minGap 0 at first"
         given |= {} if script == STEP_S else {"step": f"{plain(script)} s"}
     elif av.traci is not None:
         name = f"TraCI client {Path(av.traci.command.split()[0]).name}"
