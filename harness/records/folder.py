@@ -38,8 +38,6 @@ SHADOW, MILDER = BEFORE = ("shadow", "milder")
 """Tables of what comes before tests that count: baseline runs, which keep their first name, and milder events."""
 SEAL = "crc32"
 """Key of a JSON file's checksum."""
-ROWS_FOR_THREADS = 10_000
-"""Of a file below this, handing columns to threads costs more than decoding them (measured: 1.8 against 1.4 ms)."""
 NO_RUN = "Give a folder that `harness run` has written."
 
 
@@ -90,18 +88,6 @@ def sole_use(folder: Path) -> Iterator[None]:
 def write_bytes(path: Path, content: bytes) -> None:
     """Write a file atomically."""
     write_atomically(path, lambda temporary: temporary.write_bytes(content))
-
-
-def write_together(contents: Mapping[Path, bytes]) -> None:
-    """Write files atomically, the first one last; none is put in place before all of them are written."""
-    (path, content), *others = contents.items()
-
-    def write(temporary: Path) -> None:
-        temporary.write_bytes(content)
-        if others:
-            write_together(dict(others))
-
-    write_atomically(path, write)
 
 
 def write_json(path: Path, content: Any) -> None:
@@ -173,7 +159,7 @@ def read_table(
         require_sum(path, crc32, content, mend)
         # Faster than read_table by a millisecond.
         with pq.ParquetFile(pa.BufferReader(content), page_checksum_verification=crc32 is None) as file:
-            table = file.read(columns, use_threads=file.metadata.num_rows > ROWS_FOR_THREADS)
+            table = file.read(columns)
     except (OSError, pa.ArrowException, KeyError, UnicodeDecodeError) as error:
         raise damaged(path, error, mend) from error
     if missing := sorted(set(columns or ()).difference(table.column_names)):

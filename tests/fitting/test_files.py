@@ -74,7 +74,7 @@ def test_a_law_with_a_number_that_no_environment_allows_is_named(tmp_path, monke
     ("files", "out", "found"),
     [
         (["mine.replicates.parquet"], "mine.yaml", "mine.replicates.parquet, which is also an input"),
-        (["rows.csv"], "\udcff.yaml", "bytes that are no UTF-8"),
+        (["rows.csv"], "\udcff.yaml", "in UTF-8"),
         (["rows.csv"], "map.yaml", "map.yaml, which is also an input"),
     ],
 )
