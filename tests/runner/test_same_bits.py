@@ -180,13 +180,9 @@ def wait_until_gone(state: Path) -> None:
     raise AssertionError(f"{state} is still there")
 
 
-@pytest.mark.parametrize(
-    ("asked", "n_workers", "said"), [(None, 3, ""), (3, 3, ""), (64, 64, "64 workers share the 3")]
-)
-def test_workers_are_as_many_as_there_are_cpus_for_them_or_that_is_said(monkeypatch, capsys, asked, n_workers, said):
+@pytest.mark.parametrize(("asked", "n_workers"), [(None, 3), (64, 64)])
+def test_workers_are_as_many_as_there_are_cpus_for_them(monkeypatch, asked, n_workers):
     monkeypatch.setattr(workers, "usable_cpus", lambda: 3)
     local = workers.LocalWorkers(resolve(golden("nde-twin")), asked)
     local.close()
     assert local.n_workers == n_workers
-    assert bool(said) == bool(err := capsys.readouterr().err)
-    assert said in err
