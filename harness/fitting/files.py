@@ -19,7 +19,7 @@ from harness.fitting.distinct import fingerprint, require_distinct
 from harness.fitting.protocol import Asked, Fitted, Fitter
 from harness.fitting.table import load_mapping, recordings
 from harness.progress import Progress
-from harness.records.folder import require_place, write_bytes
+from harness.records.folder import require_place, write_together
 from harness.shown import ShownInPython
 
 OF_YAML = b"Traffic fitted by harness"
@@ -109,9 +109,7 @@ def fit_files(
     found: dict[str, Fitted] = {}
     for name, each in reversed(fitters.items()):
         found = {name: each.fitted(asked, found), **found}
-    written = {path: content for of in found.values() for path, content in of.files.items()}
-    for path, content in reversed(written.items()):  # an environment after the replicates that it names
-        write_bytes(path, content)
+    write_together({path: content for of in found.values() for path, content in of.files.items()})
     return FittedFiles(found)
 
 

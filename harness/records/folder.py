@@ -90,6 +90,18 @@ def write_bytes(path: Path, content: bytes) -> None:
     write_atomically(path, lambda temporary: temporary.write_bytes(content))
 
 
+def write_together(contents: Mapping[Path, bytes]) -> None:
+    """Write files atomically, the first one last; none is put in place before all of them are written."""
+    (path, content), *others = contents.items()
+
+    def write(temporary: Path) -> None:
+        temporary.write_bytes(content)
+        if others:
+            write_together(dict(others))
+
+    write_atomically(path, write)
+
+
 def write_json(path: Path, content: Any) -> None:
     """Write JSON atomically."""
     text = json.dumps(content, indent=2, ensure_ascii=False, allow_nan=False)

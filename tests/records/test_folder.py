@@ -19,7 +19,7 @@ import pytest
 
 from harness.errors import HarnessError, RunFolderError
 from harness.files import write_atomically
-from harness.records.folder import parquet, write_json
+from harness.records.folder import parquet, write_json, write_together
 from harness.report.summary import read_run_folder, summarise
 from harness.runner.stored import estimate_run, replay_episode
 from harness.runner.tables import read
@@ -73,6 +73,27 @@ def test_who_may_read_a_file_is_what_the_umask_says(tmp_path, umask, mode):
     finally:
         os.umask(before)
     assert (tmp_path / "file").stat().st_mode & 0o777 == mode
+
+
+def test_files_that_belong_together_are_all_old_or_all_new(tmp_path, monkeypatch):
+    paths = [tmp_path / name for name in "abc"]
+    write_together(dict.fromkeys(paths, b"old"))
+    write, n_written = Path.write_bytes, []
+
+    def fail_at_last(path: Path, content: bytes) -> int:
+        n_written.append(path)
+        if len(n_written) == len(paths):
+            half_then_fail(path)
+        return write(path, content)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "write_bytes", fail_at_last)
+        with pytest.raises(OSError, match="No space left"):
+            write_together(dict.fromkeys(paths, b"new"))
+    assert [path.read_bytes() for path in paths] == [b"old"] * 3
+    write_together(dict.fromkeys(paths, b"new"))
+    assert [path.read_bytes() for path in paths] == [b"new"] * 3
+    assert files_below(tmp_path) == set("abc")
 
 
 def test_what_a_killed_writer_has_left_goes_with_the_next_write(tmp_path):
