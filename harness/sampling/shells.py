@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
+from weakref import WeakValueDictionary
 
 import numpy as np
 import pyarrow as pa
@@ -63,6 +64,16 @@ USED_UP_SHARE = 0.95
 MOST_SHARDS_PER_ROUND = 16
 SMALLEST_SHARD = 64
 
+_IN_USE: WeakValueDictionary[str, Pool] = WeakValueDictionary()
+
+
+def pool_of(resolved: Resolved, progress: Progress) -> Pool:
+    """The pool of a campaign: the one that another run of this process, as of B beside A, has in use."""
+    key = campaign_pool_key(resolved)
+    if (pool := _IN_USE.get(key)) is None or pool.library != resolved.library:
+        pool = _IN_USE[key] = campaign_pool(resolved, progress)
+    return pool
+
 
 def stored_design(folder: Path) -> ShellDesign:
     """Strata of a stored run; a `RunFolderError` where they are missing, damaged, or of a too early version."""
@@ -82,7 +93,7 @@ class Shells(Source):
         else:
             if above := self.campaign.crash.counts_above_mps:
                 progress.remark = f" (one of its own, once: only impacts above {plain(above)} m/s are crashes)"
-            self._draw_from(campaign_pool(resolved, progress))
+            self._draw_from(pool_of(resolved, progress))
             progress.remark = ""
 
     def _draw_from(self, pool: Pool) -> None:
