@@ -240,7 +240,7 @@ def _map(axes: tuple[Shown, Shown], rows: Mapping[str, FloatArray], met: BoolArr
             last = np.searchsorted(axis.edges, axis.beyond * float(value[of].max())) + 1
             edges.append(axis.edges[max(int(np.searchsorted(axis.edges, value.min())) - 1, 0) : int(last)])
         else:
-            most = axis.beyond * float(np.quantile(value[of], 0.98)) + 1.0
+            most = axis.beyond * float(np.quantile(value[of], 1.0 if crash.any() else 0.98)) + 1.0
             edges.append(np.linspace(0.0, most, number_of + 1))
     (gap, closing), (x, y) = values, edges
     every, crashed = (np.histogram2d(gap, closing, (x, y), weights=w)[0].T for w in (weight, weight * crash))

@@ -173,7 +173,7 @@ def _scope(content: Mapping[str, Any]) -> str:
         rhw = content["per_hour"]["rhw"]
         ended += f"{'' if rhw is None else words.reached_words(rhw, share(rhw))} (asked: ± {share(target)})"
     if content["stopped_by"] == "episodes" and (target is not None or content["decision"] is not None):
-        ended += words.go_on(content["n_episodes"])
+        ended += words.go_on(content["n_episodes"], "--accept as before, " * (content["decision"] is not None))
     counted = ", that of the sum also of counted events," if content["counts_in_interval"] else ""
     return words.scope_words(content["confidence"], ended, counted)
 
@@ -241,6 +241,7 @@ def deciding_words(content: Mapping[str, Any], s_per_pair: float | None = None) 
     cost = "" if s_per_pair is None else f", {duration(n * s_per_pair)}"
     settings = "".join(f" --set {key}={value}" for key, value in needed["settings"].items())
     options = f"--margin {decision['margin'] or 0.0:g}{settings}"
+    where += ", and without stop.rhw" * (content.get("ended") == "rhw")
     return f"to decide, repeat the command with {options}{where}: about {count(n)} {pairs}{cost}"
 
 

@@ -260,15 +260,15 @@ def _scope(campaign: Campaign, manifest: Mapping[str, Any], told: Estimates) -> 
         more = "" if manifest.get("expected") and best.n_crashes else more  # `width_row` has it
         ended += f"{reached} (asked: ± {share(target)}){more}"
     elif stopped_by == "episodes":
-        ended = "all tests done" if campaign.accept is None else ended + go_on(best.n_episodes)
+        ended = "all tests done" if campaign.accept is None else ended + go_on(best.n_episodes, "--accept as before, ")
     elif stopped_by in ("rhw", "below_reference") and (given := campaign.testing.shells.statement) != ASSUMPTION_FREE:
         ended += f", given the {given}"
     return scope_words(best.confidence, ended)
 
 
-def go_on(n: int) -> str:
-    """How a run goes on whose budget of ``n`` tests is used up."""
-    return f"; go on with --resume --set stop.episodes={2 * n}"
+def go_on(n: int, limit: str = "") -> str:
+    """How a run goes on whose budget of ``n`` tests is used up; with the ``limit`` that was asked for."""
+    return f"; go on with {limit}--resume --set stop.episodes={2 * n}"
 
 
 def reached_words(rhw: float, width: str) -> str:

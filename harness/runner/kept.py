@@ -26,6 +26,7 @@ from harness.campaign.campaign import Campaign
 from harness.campaign.files import dump_campaign
 from harness.errors import RunFolderError, TooManyFailedError
 from harness.estimators.block import Block
+from harness.numbers import leaves
 from harness.records.folder import (
     CAMPAIGN,
     MANIFEST,
@@ -42,7 +43,7 @@ from harness.records.folder import (
     write_part,
     write_sealed,
 )
-from harness.records.reader import ShownTests, by_kind, signature
+from harness.records.reader import ShownTests, by_kind, read_campaign, signature
 from harness.resolved import Resolved
 from harness.runner.workers import ShardResult
 from harness.sampling.paths import BaselineResult
@@ -317,9 +318,14 @@ def require_own_folder(folder: Path, resolved: Resolved, *, resume: bool) -> dic
         raise refusal("a run of several scenarios" if several else "a folder with other files", expected, elsewhere)
     manifest = read_manifest(folder, mend=elsewhere)
     if manifest["campaign_hash"] != resolved.content_hash:
-        found = f"another campaign ({manifest.get('name')}, {manifest['campaign_hash']})"
-        mend = "Choose another folder with --out, or run the campaign.yaml that it holds."
-        raise refusal(found, f"a folder for this one ({resolved.content_hash})", mend)
+        mend = (
+            f"Choose another folder with --out, or go on by `harness run {folder / CAMPAIGN} --out {folder} --resume`."
+        )
+        held = read_campaign(folder, manifest)
+        there, here = (dict(leaves(each.model_dump(exclude={"name", "stop"}))) for each in (held, resolved.campaign))
+        apart = [f"{key} {there.get(key)}" for key in there | here if there.get(key) != here.get(key)][:3]
+        found = f"another campaign, {held.name}{': ' * bool(apart)}{', '.join(apart)}"
+        raise refusal(found, "a folder for this one, which has other settings or files", mend)
     if not (manifest["n_episodes"] or manifest["before"]):  # it was interrupted before anything was finished
         return nothing
     if manifest.get("controller_sha256") != resolved.controller_sha256:

@@ -49,6 +49,9 @@ def test_the_numbers_are_those_of_the_comparison(compared, page):
     alike = {**found, "n_only_a": 0, "n_only_b": 0, "decision": {**found["decision"], "verdict": "open"}}
     assert deciding_words(alike) == "in no pair of tests did only one crash"
     assert deciding_words(found) is None or "to decide, repeat the command" in shown.lower()
+    needed = {"pairs": 90_000, "settings": {}, "new_folder": True}
+    left_open = {**found, "to_decide": needed, "ended": "rhw", "decision": {**alike["decision"], "margin": None}}
+    assert "--margin 0 and a new --out, and without stop.rhw: about 90,000 pairs" in deciding_words(left_open)
     assert len(page.ids) == len(set(page.ids))
 
 

@@ -15,8 +15,8 @@ from junitparser import JUnitXml
 from harness.estimators.traffic import Bar, Sensitivity
 from harness.report.drawing import PlotAxis, PlotPanel
 from harness.report.junit import difference_case, statement_case, write_junit
-from harness.report.plots import POOL, sensitivity_plot, severity_plot, shells_plot
-from harness.report.summary import summarise
+from harness.report.plots import POOL, sensitivity_plot, severity_plot, shells_plot, where_plot
+from harness.report.summary import read_run_folder, summarise
 from harness.runner.stored import write_report
 from harness.vocabulary import CRASH, OUTCOMES
 from tests.report.page_text import GOLDEN, KINDS, PAGES, Page, golden_text
@@ -222,3 +222,14 @@ def test_what_moves_the_rate_most_need_not_move_its_ratio():
     said = sensitivity_plot(Sensitivity("", "smoke", "r157-cc", (gaps, speeds))).caption
     assert "The rate depends most on cut_in.ignore_share: × 0.10 to × 25;" in said
     assert "its ratio to r157-cc on lateral.speed_median_mps: × 0.519 to × 3.69." in said
+
+
+@pytest.mark.parametrize("name", ["shells-twin", "forced-twin"])
+def test_the_map_holds_every_crash(name, stored_run):
+    run = read_run_folder(stored_run(name))
+    summary = summarise(run)
+    crashed = summary.rows["outcome"] == CRASH
+    for panel, axes in zip(where_plot(run, summary).panels, run.family.maps, strict=True):
+        for axis, shown in zip((panel.x, panel.y), axes, strict=True):
+            assert axis.low <= shown.of(summary.rows)[crashed].min()
+            assert shown.of(summary.rows)[crashed].max() <= axis.high

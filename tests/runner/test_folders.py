@@ -48,8 +48,8 @@ def complaint_of(capsys):
     ("more", "said"),
     [
         ((), "--resume"),
-        (("--set", "seed=2"), "another campaign (golden,"),
-        (("--set", "testing.epsilon=0.2", "--resume"), "another campaign"),
+        (("--set", "seed=2"), "another campaign, golden: seed 1"),
+        (("--set", "testing.epsilon=0.2", "--resume"), "another campaign, golden: testing.epsilon "),
         (("--set", "stop.episodes=150", "--resume"), "240 finished tests"),
     ],
 )
