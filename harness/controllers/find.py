@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import importlib
+import math
 import os
 import re
 import sys
@@ -312,7 +313,10 @@ def script_step_s(av: AutomatedVehicle) -> float:
     if (idle_s := idle * STEP_S * (every or 1)) > LONGEST_IDLE_S:
         told = f"looks at no vehicle in the first {idle_s:.1f} s of a test, in which a car may cut in"
         _tell_once(f"{file} {told}: a test is one run of it from its first line, so leave out steps that only wait")
-    if hardest > bound and "decel_mps2" not in av.traci_style.model_fields_set:
+    if math.isinf(hardest):
+        told = "sets a speed mode in which no decel bounds its braking; tests fail beyond av.limits"
+        _tell_once(f"{file} {told}: leave that call out, or use mode 31")
+    elif hardest > bound and "decel_mps2" not in av.traci_style.model_fields_set:
         told = f"asks for harder braking than {bound:g} m/s², the decel of SUMO's default type, and gets that"
         _tell_once(f"{file} {told}; of another type: --set av.traci_style.decel_mps2=8, say")
     return STEP_S * (every or 1)

@@ -124,7 +124,7 @@ class _Tried(VehicleDomain):
     """Notes what a script does.
 
     Which vehicles it commands, whether it ``drives``, its ``hardest`` braking (m/s²) that its vehicle's type bounds,
-    and how many steps it is ``idle``, looking at no vehicle.
+    infinite where a speed mode lets nothing bound it, and how many steps it is ``idle``, looking at no vehicle.
     """
 
     def __init__(self, ego: str) -> None:
@@ -138,8 +138,8 @@ class _Tried(VehicleDomain):
 
     def next_acceleration(self) -> float:
         acceleration = super().next_acceleration()
-        if math.isinf(self._decel) and self._speed_mode & DECEL:  # no bound of its own
-            self.hardest = max(self.hardest, -acceleration)
+        if math.isinf(self._decel) and acceleration < 0.0:  # no bound of its own
+            self.hardest = max(self.hardest, -acceleration if self._speed_mode & DECEL else math.inf)
         return acceleration
 
     def see(self, now: Observation) -> None:
