@@ -481,6 +481,8 @@ class Division:
                 **dict.fromkeys(KeptEvents.__dataclass_fields__, unknown) | {"motion": np.zeros(int(shadow_runs))}
             ),
             "p_after_failure": 0.0,
+            "p_held": math.nan,
+            "p_held_se": 0.0,
         }
         template = Pool(**content | {"key": "drawn", "library": reduced, "names": names, "n_paths": pool_paths})
         self._shells = OvertakingShells(template, limit_mps2, mass)
