@@ -222,7 +222,7 @@ def where_plot(run: RunFolder, summary: RunSummary | None = None) -> Plot | None
     n_crashes = count(int(np.count_nonzero(rows["outcome"][met] == CRASH)))
     text = (
         f"Each of {count(met.sum())} {words.events} by its {x} and {y}; {n_crashes} of them crashed. "
-        "Where no cell is drawn, nothing was tested."
+        "Where these axes have no cell, nothing was tested."
     )
     return Plot("where", panels, text, text)
 
