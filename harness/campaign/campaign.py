@@ -157,7 +157,9 @@ class Campaign(Section):
         """
         others = {} if self.scenario == DEFAULT_FAMILY else {"scenario": self.scenario}
         unused = set() if self.av.acts_before_event else {"shadow_paths"}
-        challenged = {"challenge": challenge or self.testing.challenge}
+        testing = self.testing.model_dump(exclude={"estimator"}) | {"challenge": challenge or self.testing.challenge}
+        if not self.testing.shells.beyond_envelope:
+            del testing["shells"]["beyond_envelope"]
         content = others | {
             "crash": self.crash.model_dump(),
             "seed": self.seed,
@@ -165,7 +167,7 @@ class Campaign(Section):
             "environment_parameters": environment_parameters,
             "av": self.av.identity(),
             "surrogates": [(name, model.identity()) for name, model in self.surrogates.items()],
-            "testing": self.testing.model_dump(exclude={"estimator"}) | challenged,
+            "testing": testing,
             "pool": self.pool.model_dump(exclude=unused) if self.sampling.strata else None,
             "engine": self.world.engine,
             "moments": self.records.moments,

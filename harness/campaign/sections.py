@@ -135,6 +135,8 @@ class ShellSettings(Section):
     """tests of each shell before any is preferred; none: by its probability"""
     smallest_round: Whole = Field(1, ge=1, le=10_000)
     """fewest tests of a round; raise it for many workers"""
+    beyond_envelope: bool = False
+    """test also events on which not even full throttle crashes, as is done anyway for an AV that accelerates harder"""
 
 
 CHALLENGE = r"^(immediate|recursive|.+\.py:\w+)$"

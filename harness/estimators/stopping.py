@@ -345,11 +345,12 @@ class PairRule(Rule):
         return self.look.stopped or given_up
 
     def more_pairs(self, pairs: Pairs) -> float:
-        """How many times as many pairs would decide, if they end as often; infinite where nobody can tell."""
+        """How many times as many pairs mostly decide, if they end as often; infinite where nobody can tell."""
         watched, times = pairs.within(self._statement), 1.0
         while times < MOST_TIMES:
             times *= LOOK_RATIO
-            if self._verdict(watched.times(times)) != "open":
+            ahead = watched.times(times)
+            if ahead.verdict(self.decision.margin or 0.0, self._level(ahead).likely()) != "open":
                 return times
         return math.inf
 

@@ -21,7 +21,7 @@ from harness.families import family_named
 from harness.families.protocol import Environment
 from harness.pool.aim import PILOT_PATHS, Enumerator
 from harness.pool.build import take_aim
-from harness.pool.shells import Pool, acceleration_limit, shells_in_strata, shells_of, strata_of_shells
+from harness.pool.shells import Pool, shells_in_strata, shells_of, strata_of_shells, tested_limit
 from harness.progress import Progress
 from harness.resolved import Resolved
 from harness.strata import Assumed, ShellDesign
@@ -145,7 +145,7 @@ def assumed(
     ends = [environment_with(traffic, each) for each in left.ends]
     if None in ends:
         return None
-    paths = FewPaths(traffic, pool, design, acceleration_limit(traffic.campaign.av), progress)
+    paths = FewPaths(traffic, pool, design, tested_limit(traffic.campaign), progress)
     base, *moved = paths.of([traffic.environment, *filter(None, ends)])
     low, high = (tuple(ratio_of(each.p, base.p).tolist()) for each in moved)
     return asdict(Assumed(left.where, left.highest, (low, high), left.share))

@@ -20,6 +20,7 @@ import numpy as np
 import pyarrow as pa
 
 from harness import elementary
+from harness.campaign.campaign import Campaign
 from harness.campaign.drivers import BuiltInParameters
 from harness.campaign.vehicle import AutomatedVehicle
 from harness.families.protocol import Chosen
@@ -204,6 +205,11 @@ def acceleration_limit(av: AutomatedVehicle) -> float:
     return math.inf if av.sumo is not None else av.limits.max_acceleration_mps2
 
 
+def tested_limit(campaign: Campaign) -> float:
+    """Hardest acceleration that a campaign's strata allow for."""
+    return math.inf if campaign.testing.shells.beyond_envelope else acceleration_limit(campaign.av)
+
+
 def shells_in_strata(pool: Pool, limit_mps2: float) -> list[list[int]]:
     """Which shells of the pool make up each stratum, for a vehicle that accelerates so hard; empty ones none."""
     boundary = boundary_shell(pool)
@@ -297,7 +303,7 @@ class PrescribedEpisodes:
 
     def __init__(self, resolved: Resolved, pool: Pool) -> None:
         campaign, self._resolved = resolved.campaign, resolved
-        limit = acceleration_limit(campaign.av)
+        limit = tested_limit(campaign)
         design, groups = design_shells(pool, limit), shells_in_strata(pool, limit)
         self._kept = pool.events
         self._cells = cells_in_strata(pool, groups)[0]

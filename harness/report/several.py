@@ -260,7 +260,9 @@ def rates_of(side: Mapping[str, Any]) -> dict[str, Any]:
 def ratio_words(of: Mapping[str, Any]) -> tuple[str, str]:
     """A over B, and its interval."""
     most = "no limit" if of["ratio_high"] is None else ratio(of["ratio_high"])
-    return ("–", "") if of["ratio"] is None else (ratio(of["ratio"]), f"{ratio(of['ratio_low'])} to {most}")
+    if of["ratio"] is None:  # the one below has not crashed
+        return "–", f"≥ {ratio(of['ratio_low'])}" if of["ratio_low"] else ""
+    return ratio(of["ratio"]), f"{ratio(of['ratio_low'])} to {most}"
 
 
 def alone_words(of: Mapping[str, Any]) -> str:

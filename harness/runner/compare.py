@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -18,7 +18,6 @@ from harness.arguments import AtLeastOne, checked
 from harness.campaign.campaign import Campaign
 from harness.campaign.files import campaign_of
 from harness.campaign.sections import MOST_EVENTS
-from harness.campaign.vehicle import Limits
 from harness.errors import CampaignError, RunFolderError, told_of
 from harness.estimators.answer import ended_by
 from harness.estimators.estimate import finite_json
@@ -28,12 +27,12 @@ from harness.estimators.per_hour import OfFamily, PerHour
 from harness.estimators.stopping import PairRule
 from harness.families import family_named
 from harness.numbers import leaves, two_digits_up
-from harness.pool.shells import acceleration_limit
+from harness.pool.shells import tested_limit
 from harness.progress import Progress
 from harness.records.folder import CAMPAIGN, read_manifest, require_sum, write_sealed
 from harness.records.reader import code_of, require_trust
 from harness.report.words import doubts_of
-from harness.resolved import require_ready
+from harness.resolved import Resolved, require_ready
 from harness.runner.paired import SIDES, Both, PairedScenario, copy_stored, drive_pairs, together
 from harness.runner.run import hour_answer, require_no_other
 from harness.runner.stored import MEND, read_families, replay_episode
@@ -156,10 +155,8 @@ def compare_campaigns(
         for side, whole in zip("AB", (a, b), strict=True):
             with told_of(f"{side}, {name}" if a.scenarios else side):
                 each_ready.append(require_ready(whole.of_family(name) if whole.scenarios else whole, "compare"))
-        of_a, of_b = each_ready
-        require_comparable(of_a.campaign, of_b.campaign)
-        require_same_shells((of_a, of_b))
-        ready[out / folder] = of_a, of_b
+        require_comparable(*(each.campaign for each in each_ready))
+        ready[out / folder] = _with_same_shells(*each_ready, a_is_stored=stored is not None)
     if stored is not None:
         for folder in folders.values():
             copy_stored(stored / folder, out / folder / "a", ready[out / folder][0])
@@ -282,17 +279,18 @@ def require_comparable(a: Campaign, b: Campaign) -> None:
         raise CampaignError(where, f"{of_a.get(where)} in A and {of_b.get(where)} in B{more}", expected, mend)
 
 
-def require_same_shells(sides: Both) -> None:
-    """Refuse vehicles that would not have the same strata of events."""
-    limits = [acceleration_limit(of_side.campaign.av) for of_side in sides]
-    envelope = sides[0].library.envelope_mps2
-    if (limits[0] > envelope) != (limits[1] > envelope):
-        found = f"a hardest acceleration of {limits[0]:g} m/s² in A and {limits[1]:g} m/s² in B"
-        expected = f"both up to {envelope:g} m/s², the envelope of the surrogate library, or both above"
-        av = sides[limits[1] > envelope].campaign.av
-        section = "limits" if av.model is None else "parameters"
-        limit = f"av.{section}.max_acceleration_mps2={envelope:g}"
-        mend = f"Add --set {limit}, which limits both (by default {Limits().max_acceleration_mps2:g})."
-        if av.source == "sumo":
-            mend = "Nothing in the harness limits what SUMO drives: compare it with another such vehicle."
-        raise CampaignError("av", found, expected, mend)
+def _with_same_shells(a: Resolved, b: Resolved, *, a_is_stored: bool) -> Both:
+    """Both with the strata of the one that accelerates harder, where only that is tested beyond the envelope."""
+    narrow = [tested_limit(each.campaign) <= a.library.envelope_mps2 for each in (a, b)]
+    if not any(narrow) or all(narrow):
+        return a, b
+    if narrow[0] and a_is_stored:
+        expected = "a run with beyond_envelope: true, as B accelerates harder than the library's full throttle"
+        mend = f"Name its {CAMPAIGN} for A, which drives it anew."
+        raise CampaignError("testing.shells.beyond_envelope", "false in the stored run of A", expected, mend)
+    own = b if narrow[1] else a
+    campaign = own.campaign.replaced(("testing", "shells", "beyond_envelope"), True)
+    widened = replace(
+        own, campaign=campaign, content_hash=campaign.content_hash(own.parameters.content_hash(), own.challenge)
+    )
+    return (a, widened) if narrow[1] else (widened, b)

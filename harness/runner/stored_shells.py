@@ -25,7 +25,7 @@ from harness.estimators.shells import SeenShells
 from harness.numbers import share
 from harness.pool.build import campaign_pool
 from harness.pool.moved import FewPaths, OnPaths, environment_with, ranges, ratio_of
-from harness.pool.shells import Pool, acceleration_limit, design_shells
+from harness.pool.shells import Pool, design_shells, tested_limit
 from harness.progress import Progress
 from harness.records.folder import read_manifest
 from harness.records.reader import read_campaign
@@ -80,7 +80,7 @@ class StoredShells:
             raise CampaignError(option, found, expected, ELSEWHERE)
         here = resolve(campaign)
         design, pool = stored_design(folder), campaign_pool(here, progress)
-        rebuilt = design_shells(pool, acceleration_limit(campaign.av))
+        rebuilt = design_shells(pool, tested_limit(campaign))
         if design.strata != rebuilt.strata or not np.allclose(design.p, rebuilt.p, rtol=SAME_POOL):
             expected = f"shells as those of pool {pool.key}"
             mend = "Use the version of the harness (manifest.json) and the surrogate library that it was made with."
@@ -91,7 +91,7 @@ class StoredShells:
     @property
     def limit_mps2(self) -> float:
         """Hardest acceleration of the vehicle."""
-        return acceleration_limit(self.here.campaign.av)
+        return tested_limit(self.here.campaign)
 
     @cached_property
     def seen(self) -> SeenShells:

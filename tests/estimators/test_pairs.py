@@ -160,6 +160,23 @@ def test_pairs_that_would_decide_do():
     assert rule.more_pairs(none) == float("inf")
 
 
+@pytest.mark.parametrize(("of_looks", "least", "most"), [(False, 0.85, 1.01), (True, 0.3, 0.7)])
+def test_pairs_that_would_decide_do_in_most_cases(monkeypatch, of_looks, least, most):
+    """Where all ends as often as was seen; of limits as wide as those of a look it is some half."""
+    *_, (rule, pairs) = rounds_of("library", ALIKE, 5)
+    if of_looks:
+        monkeypatch.setattr(Level, "likely", lambda level: level)
+    (seen,), times, rng = pairs.each, rule.more_pairs(pairs), np.random.default_rng(1)
+    decided = 0
+    for _ in range(100):
+        ends = np.array(
+            [rng.multinomial(round(of.sum() * times), of.ravel() / max(of.sum(), 1)).reshape(3, 3) for of in seen.ends]
+        )
+        again = Pairs((PairCounts(seen.design, ends, seen.mass * times),)).within("library")
+        decided += again.verdict(0.0, rule._level(again)) != "open"
+    assert least < decided / 100 < most
+
+
 LEVEL = Level.two_sided(0.9)
 
 

@@ -211,13 +211,6 @@ def test_it_ends_when_it_is_known_who_crashes_less_often(campaigns, done, tmp_pa
     ("shared", "other", "said"),
     [
         (("testing.method=forced",), HARDER, "forced, in a comparison"),
-        (SHELLS, "av.parameters.max_acceleration_mps2=5", r"--set av\.parameters\.max_acceleration_mps2=2"),
-        (
-            SHELLS,
-            "av={controller: 'tests.controllers.early:Speeds'}",
-            r"--set av\.limits\.max_acceleration_mps2=2.*default",
-        ),
-        ((*SHELLS, "world.engine=sumo"), "av={sumo: {carFollowModel: ACC}}", "Nothing in the harness limits"),
         ((*SHELLS, "accept.crash_rate_below=1e-7"), HARDER, "a limit of one crash rate"),
         (SHELLS, "av={controller: 'tests.controllers.early:Speeds', before_event: controller}", "events of its own"),
         (SHELLS, "testing.epsilon=0.2", r"^testing\.epsilon"),
@@ -227,6 +220,22 @@ def test_what_cannot_be_compared_is_refused(tmp_path, shared, other, said):
     with pytest.raises(CampaignError, match=said):
         compare_campaigns(campaign(*shared), campaign(*shared, other), tmp_path / "out")
     assert not (tmp_path / "out" / "a").exists()
+
+
+def test_where_one_accelerates_harder_both_are_tested_beyond_the_envelope(tmp_path):
+    """As such a vehicle may crash there; a stored run that was not is driven anew."""
+    asked = [each.replace("=library", "=assumption_free") for each in SHELLS]
+    gentle, harder = campaign(*asked), campaign(*asked, "av.parameters.max_acceleration_mps2=5")
+    for at, sides in enumerate([(gentle, harder), (harder, gentle)]):
+        found = compare_campaigns(*sides, tmp_path / str(at), workers=1)
+        tested = [json.loads((found.folder / side / "shells.json").read_text()) for side in "ab"]
+        assert tested[0]["cell_p"] == tested[1]["cell_p"]
+        assert tested[0]["p_unreachable"] == pytest.approx(0.0, abs=1e-15)
+    stored = tmp_path / "0" / "b"
+    assert compare_campaigns(harder, gentle, tmp_path / "2", workers=1, stored=stored).content["n_pairs"] > 0
+    alone = run_here(gentle, tmp_path / "alone").folder
+    with pytest.raises(CampaignError, match="beyond_envelope: found false in the stored run of A"):
+        compare_campaigns(gentle, harder, tmp_path / "3", workers=1, stored=alone)
 
 
 def test_one_end_is_asked_for(campaigns, tmp_path):
