@@ -199,8 +199,8 @@ class PoolSettings(Section):
     library: str | None = None
     """name of a shipped surrogate library, or a path to your own; none: the traffic's"""
     relative_error: float | None = Field(None, ge=LEAST_POOL_ERROR, le=0.2)
-    """relative standard error of the surrogates' crash rates, four times that beyond the boundary; none: the
-    scenario's, 0.005 or 0.01"""
+    """relative standard error of surrogates' crash rates, four times that of few paths or beyond the boundary; none:
+    the scenario's, 0.005 or 0.01"""
     events_per_shell: Whole = Field(25_000, ge=100, le=MOST_EVENTS)
     """events kept of each shell: its most tests"""
     shadow_paths: Whole = Field(500, ge=50, le=100_000)

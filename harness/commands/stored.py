@@ -148,7 +148,7 @@ def sensitivity(folder: Path, *, ranges: dict[str, tuple[float, float]], as_json
     """Say by how much each number of the traffic moves the crash rate of the run in DIR, and its ratio to r157-cc.
 
     Fitted numbers move by their standard errors, or together by replicates; assumed ones over their ranges. Nothing is
-    simulated in SUMO; it takes minutes, once. The result is kept in DIR/sensitivity.json and shown on the page.
+    simulated in SUMO; it takes a minute, once. The result is kept in DIR/sensitivity.json and shown on the page.
     Of several scenarios it is the sum that moves: with the numbers of each, and with how often its events are met.
     """
     with progress_bar() as bar:
