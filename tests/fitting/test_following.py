@@ -7,6 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pandas as pd
 import pytest
+from scipy import ndimage
 
 from harness.campaign.sections import EnvironmentSettings
 from harness.cli import main
@@ -119,6 +120,27 @@ def test_an_error_of_measurement_is_no_braking():
     found = BrakingFitter().seen(track)
     assert found.hours == 0.0
     assert "noise of 0.2" in found.why
+
+
+def test_errors_that_neighbouring_rows_share_are_no_brakings():
+    """As where positions were smoothed: no noise from row to row, but vehicles speed up as hard as they brake."""
+    smoothed = led(np.full(6000, 32.0))
+    errors = ndimage.gaussian_filter1d(np.random.default_rng(1).standard_normal(len(smoothed)), 3.0)
+    smoothed["speed_mps"] += 0.6 * errors / errors.std()
+    track = recording(smoothed)
+    assert noise_of(track) < 0.5 * MOST_NOISE_MPS2
+    found = BrakingFitter().seen(track)
+    assert (found.hours, found.events.size) == (0.0, 0)
+    assert "speed up by 3 m/s² or more" in found.why
+
+
+@pytest.mark.parametrize(("last_s", "known"), [(21.3, False), (22.6, True)])
+def test_a_peak_is_known_once_it_is_held(last_s, known):
+    """In a track that ends while the braking grows it is a lower limit, and else the one that is seen."""
+    rows = led(one_braking(9.0))
+    (event,) = BrakingFitter().seen(recording(rows[(rows.vehicle_id == "1") | (rows.time_s < last_s)])).events
+    assert event["ended"] == known
+    assert (abs(event["peak_mps2"] - 9.0) < 0.05) == known
 
 
 @pytest.mark.parametrize("n_followers", [1, 3])

@@ -22,6 +22,8 @@ from harness.vocabulary import BoolArray, FloatArray, IntArray, RecordArray
 LOWEST_MPS2 = 3.0
 """Of the shipped law's peaks."""
 RELEASED_MPS2 = 1.0
+GROWS_MPS2 = 0.02
+"""More, from row to row, than a deceleration that is held [assumed]."""
 MEDIAN_S = 0.4
 """Time over which speeds are replaced by their median [assumed]."""
 SHORT_S, PRECISE_MPS2 = 0.5, 0.05
@@ -29,6 +31,9 @@ SHORT_S, PRECISE_MPS2 = 0.5, 0.05
 MOST_NOISE_MPS2 = 0.1
 """Noise of decelerations above which nothing is counted [assumed]: the hardest slope of a braking is too hard by as
 much."""
+MOST_UPWARD = 0.1
+"""Share of speeding up so hard above which brakings are errors as well [assumed]: errors that neighbouring rows share,
+as where positions were smoothed, are no noise from row to row."""
 EVENT = np.dtype([("peak_mps2", np.float64), ("ended", np.bool_)])
 
 
@@ -38,14 +43,18 @@ class BrakingFitter(FollowingFitter):
     family, events = LEAD_BRAKES, f"brakings of {LOWEST_MPS2:g} m/s² or more"
 
     def seen(self, track: Recording) -> Seen:
-        if (noise := noise_of(track)) > MOST_NOISE_MPS2:
-            why = f"noise of {noise:.2g} m/s² in their decelerations, where at most {MOST_NOISE_MPS2:g} tell"
-            return Seen(0.0, np.empty(0, EVENT), f"{why} brakings from errors")
         hard, known = decelerations(track, SHORT_S if noise_of(track, SHORT_S) < PRECISE_MPS2 else 1.0)
         of = followed(track)
-        row, events = brakings(hard, known, track.piece)
+        (row, events), (up, _) = (brakings(each, known, track.piece) for each in (hard, -hard))
+        events, n_up = events[of.behind[row] >= 0], int((of.behind[up] >= 0).sum())
         hours = float((of.follows & known[of.ahead]).sum()) / track.rate_hz / 3600.0
-        return Seen(hours, events[of.behind[row] >= 0])
+        if (noise := noise_of(track)) > MOST_NOISE_MPS2:
+            why = f"noise of {noise:.2g} m/s² in decelerations: at most {MOST_NOISE_MPS2:g} tell brakings from errors"
+        elif n_up > max(1.0, MOST_UPWARD * events.size):
+            why = f"{n_up} vehicles speed up by {LOWEST_MPS2:g} m/s² or more, and {events.size} brake so: errors"
+        else:
+            return Seen(hours, events)
+        return Seen(0.0, events[:0], why)
 
     def numbers(self, events: RecordArray) -> Numbers:
         scale, se = tail_scale(events["peak_mps2"], events["ended"])
@@ -67,7 +76,8 @@ def decelerations(track: Recording, window_s: float) -> tuple[FloatArray, BoolAr
 def brakings(hard: FloatArray, known: BoolArray, piece: IntArray) -> tuple[IntArray, RecordArray]:
     """Rows (k,) in which decelerations (n,) first reach the lowest peak, and what they are: `EVENT`.
 
-    One whose track ends in it has a peak of at least the hardest seen; one that begins beyond the lowest peak is none.
+    One that still grows where its track ends has a peak of at least the hardest seen, and has not ``ended``; one that
+    begins beyond the lowest peak is none.
     """
     braking = known & (hard >= RELEASED_MPS2)
     same = np.diff(piece) == 0
@@ -76,11 +86,13 @@ def brakings(hard: FloatArray, known: BoolArray, piece: IntArray) -> tuple[IntAr
     last = np.flatnonzero(braking & ~np.append(goes_on[1:], False))
     rows, events = [], []
     for begin, end in zip(first.tolist(), last.tolist(), strict=True):
-        peak = hard[begin : end + 1].max()
+        part = hard[begin : end + 1]
+        peak = part.max()
         cut_off = begin == 0 or not known[begin - 1]
         if peak >= LOWEST_MPS2 and not (cut_off and hard[begin] >= LOWEST_MPS2):
-            rows.append(begin + int(np.argmax(hard[begin : end + 1] >= LOWEST_MPS2)))
-            events.append((peak, end + 1 < known.size and known[end + 1]))
+            grows = part[-1] > part[:-1].max(initial=0.0) + GROWS_MPS2  # of one held, the peak is known
+            rows.append(begin + int(np.argmax(part >= LOWEST_MPS2)))
+            events.append((peak, not grows or (end + 1 < known.size and known[end + 1])))
     return np.array(rows, np.int64), np.array(events, EVENT)
 
 
