@@ -65,7 +65,9 @@ NUMBERS = (
 )
 SOME_LENGTH = ColumnRule("length_m", lambda x: x >= 0.5, "length_m {:g}", "a length of 0.5 m or more", NO_LENGTH)
 NEAR_TIME = _near("time_s", 1e7)
-NEAR = _near("s_m", 1e5), _near("lane", 20), _near("length_m", 50.0), _near("speed_mps", 60.0)
+OTHER_WAY = "Give what drives the other way positive speeds, rising s_m and another direction; or delete it."
+FORWARD = ColumnRule("speed_mps", lambda v: v > -JUMP_MPS, "speed_mps {:g}", "one that drives forward", OTHER_WAY)
+NEAR = _near("s_m", 1e5), _near("lane", 20), _near("length_m", 50.0), _near("speed_mps", 60.0), FORWARD
 
 
 def require(rule: ColumnRule, rows: pd.DataFrame, where: Callable[[int], str]) -> None:

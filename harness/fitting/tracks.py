@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -97,7 +98,13 @@ def slopes(track: Recording, rows: IntArray) -> FloatArray:
 
 
 def noise_of(track: Recording, window_s: float = 1.0) -> float:
-    """Standard deviation (m/s²) of slopes by white noise, from third differences, to which motion adds little."""
+    """Standard deviation (m/s²) of slopes by white noise, from third differences, to which motion adds little.
+
+    Speeds are off by a step's uniform error, too, where they are rounded: their smallest change is that step.
+    """
     same = track.piece[3:] == track.piece[:-3]
     third = np.diff(track.v, 3)[same]
-    return float(np.sqrt(third @ third / max(third.size, 1) / 20.0) * np.linalg.norm(slope_weights(track, window_s)))
+    change = np.abs(np.diff(track.v)[np.diff(track.piece) == 0])
+    step = float(np.quantile(np.append(change[change > 1e-6], 0.0), 0.01, method="higher"))
+    sd = max(np.sqrt(third @ third / max(third.size, 1) / 20.0), step / math.sqrt(12.0))
+    return float(sd * np.linalg.norm(slope_weights(track, window_s)))

@@ -162,6 +162,14 @@ def test_noise_widens_accelerations_little_and_is_told(tmp_path):
     assert all(each.noise_mps2 < 1e-2 for each in clean)
 
 
+def test_speeds_in_coarse_steps_are_noise(tmp_path):
+    """As in whole miles per hour: most differences of rows are none, so that third differences alone show a third."""
+    rows = overtaking(2.0)
+    step = 0.447
+    found = observed(rows.assign(speed_mps=step * (rows.speed_mps / step).round()), tmp_path)[0]
+    assert np.mean([each.noise_mps2 for each in found]) == pytest.approx(0.953 * step / 12**0.5, rel=0.05)
+
+
 def test_long_leads_are_missed_no_more_often_than_short_ones(tmp_path):
     """Only crossings seen for a while count, whatever their lead; one whose onset was not seen is a long one."""
     rows = overtaking(3.0)

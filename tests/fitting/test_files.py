@@ -45,6 +45,8 @@ def test_a_fit_is_read_whatever_it_is_called_and_the_same_seed_gives_the_same_by
     assert main(["fit", "rows.parquet", "--out", "again/a #1: b.yaml", "--replicates", "5", "--quiet"]) == 0
     out = capsys.readouterr().out
     assert "! only 5 replicates (a 90 % interval needs at least 20)" in out
+    assert "cut_in: exposure is not fitted: kept is 0.048 per hour" in out
+    assert "noise of" not in out
     assert out.endswith("next: harness run my_av.py:MyAV --set 'environment.parameters=again/a #1: b.yaml'\n")
     again = list((tmp_path / "again").iterdir())
     assert len(again) >= 3

@@ -125,6 +125,12 @@ REFUSED = {
         lambda: ROWS.assign(**{c: ROWS[c] * np.where(ROWS.vehicle_id == 2, 3.6, 1.0) for c in ("s_m", "speed_mps")}),
         r"vehicle 2 of .*found speed_mps 1\d\d\.\d*; expected at most 60 from the median",
     ),
+    "the other carriageway": (
+        lambda: congested().assign(
+            **{c: congested()[c] * np.where(ROWS.vehicle_id == 2, -1, 1) for c in ("s_m", "speed_mps")}
+        ),
+        r"vehicle 2 of .*found speed_mps -1\d\.\d*; expected one that drives forward",
+    ),
     "one recording stands still": (
         changed(s_m=ROWS.s_m.where(ROWS.recording_id != 3, first("s_m"))),
         r"of recording 3, t = 0 s\): found s_m -40, and -40 in row 4981, where speeds say -36.* such pairs of rows",

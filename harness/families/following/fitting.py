@@ -129,6 +129,8 @@ class FollowingFitter:
         seen = {"note": f"{kept.note or kept.source}; {EXCLUDED}: {n} in {hours:.4g} h of following"}
         content: Numbers = {"exposure": {"per_hour": kept.model_dump(exclude_none=True) | seen}} if outside else {}
         excluded = ", which these data exclude" if outside else ""
-        told += f" ({limits} per hour); at least {FEWEST_COUNTED} are needed{needed}: kept is {number(kept.value)}"
-        told += f" per hour, in scope or not [{kept.source}]{excluded}, and the law of {self.family.default_parameters}"
-        return content, told
+        told += f" ({limits} per hour)" * (hours > 0.0)
+        told += (
+            f"; at least {FEWEST_COUNTED} are needed{needed}: kept is {number(kept.value)} per hour, in scope or not"
+        )
+        return content, f"{told} [{kept.source}]{excluded}, and the law of {self.family.default_parameters}"

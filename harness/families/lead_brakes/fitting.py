@@ -86,13 +86,10 @@ def brakings(hard: FloatArray, known: BoolArray, piece: IntArray) -> tuple[IntAr
     last = np.flatnonzero(braking & ~np.append(goes_on[1:], False))
     rows, events = [], []
     for begin, end in zip(first.tolist(), last.tolist(), strict=True):
-        part = hard[begin : end + 1]
-        peak = part.max()
-        cut_off = begin == 0 or not known[begin - 1]
-        if peak >= LOWEST_MPS2 and not (cut_off and hard[begin] >= LOWEST_MPS2):
-            grows = part[-1] > part[:-1].max(initial=0.0) + GROWS_MPS2  # of one held, the peak is known
+        part, cut_off = hard[begin : end + 1], begin == 0 or not known[begin - 1]
+        if part.max() >= LOWEST_MPS2 and not (cut_off and part[0] >= LOWEST_MPS2):
             rows.append(begin + int(np.argmax(part >= LOWEST_MPS2)))
-            events.append((peak, not grows or (end + 1 < known.size and known[end + 1])))
+            events.append((part.max(), part[-1] <= part[:-1].max(initial=0.0) + GROWS_MPS2))
     return np.array(rows, np.int64), np.array(events, EVENT)
 
 

@@ -20,7 +20,7 @@ from harness.campaign.models import Places, read_model, validated
 from harness.campaign.sections import EnvironmentSettings
 from harness.campaign.yaml_text import yaml_text
 from harness.errors import CampaignError, TrajectoryError
-from harness.families.cut_in.family import CUT_IN
+from harness.families.cut_in.family import CUT_IN, EXPOSURE
 from harness.families.cut_in.fitting.hazard import FREE_TTC_S, TTC_EDGES_S, Acceptance, fit_hazard
 from harness.families.cut_in.fitting.laws import BASE, LAWS, FittedLaw, ObservedTraffic, fit_rate
 from harness.families.cut_in.fitting.observations import BesideCounts, Observations, observe, require_enough
@@ -43,6 +43,8 @@ OF_PAGE = b"Traffic fitted to trajectories"
 HEAVIEST_TAILS = (None, 5.0, 8.0, 12.0, 30.0, 100.0)
 """Degrees of freedom of R1dot: fitted (None), then tried until LV's speed is one that SUMO's lanes allow."""
 DIGITS = 6
+MOST_NOISE_MPS2 = 0.05
+"""Of accelerations, which scatter by some 0.25 m/s²: more is told [assumed]."""
 MOST_DRAWS = 5
 """At most this many times the replicates asked for are drawn, as tests cannot be drawn from some."""
 
@@ -190,7 +192,7 @@ class CutInFitter:
         told = [line for each in others.values() for line in each.told]
         shows = page(fit, tally, noise_mps2, asked, told)
         files = {out: text.encode(), shown: shows.encode(), beside: drawn}
-        return Fitted(files, _told(fit, tally, asked), _facts(fit, tally))
+        return Fitted(files, _told(fit, tally, asked, noise_mps2), _facts(fit, tally))
 
 
 def _text(fit: Fit, tally: BesideCounts, asked: Asked) -> str:
@@ -205,9 +207,10 @@ def _text(fit: Fit, tally: BesideCounts, asked: Asked) -> str:
     return environment_text(head, fit.environment.model_dump(exclude_defaults=True))
 
 
-def _told(fit: Fit, tally: BesideCounts, asked: Asked) -> tuple[str, ...]:
+def _told(fit: Fit, tally: BesideCounts, asked: Asked, noise_mps2: float) -> tuple[str, ...]:
     traffic, steps, unseen = fit.traffic, fit.acceptance, fit.environment.unseen
     side = "left" if asked.read.mirror else "right"
+    noisy = f"! noise of {noise_mps2:.2g} m/s² in accelerations: the scatter of the fitted ones is off by as much"
     limited = f"! no lane change seen at {unseen}: rates of crashes that begin there have only an upper limit"
     return (
         f"{traffic.n_recordings:,} recordings, {tally.vehicles:,} vehicles, {tally.driven_s / 3600.0:.2f} h beside the "
@@ -215,6 +218,8 @@ def _told(fit: Fit, tally: BesideCounts, asked: Asked) -> tuple[str, ...]:
         f"in front of a vehicle that closes in within 8 s: {int(steps.events[:-1].sum()):,} lane changes; "
         f"{steps.exposure[:-1].sum():.1f} expected if nobody minded it",
         *(f"kept as in {BASE}: {what} ({why})" for what, why in fit.kept.items()),
+        f"cut_in: exposure is not fitted: kept is {EXPOSURE.per_hour:g} per hour, counted in other trajectories",
+        *([noisy] if noise_mps2 > MOST_NOISE_MPS2 else []),
         *([limited] if unseen else []),
         *(f"! {words}" for words in too_few(asked.n_replicates, CONFIDENCE)),
     )
