@@ -99,7 +99,7 @@ def limits_list() -> str:
     return told + (
         f"\nOf all cut-ins {short:.1%} take at most 1.5 s; in {fast:.1%} of the tests the AV is faster than 144 km/h. "
         f"Default vehicle, {found['crash_rate']:.3g} per test, {found['n_crashes']:,} sampled crashes. "
-        f"`{found['command']}`\n"
+        f"`{found['command']}`, whose head shows the run\n"
     )
 
 
