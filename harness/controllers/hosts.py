@@ -317,9 +317,8 @@ class VehicleHost(Host):
 
 def _step(controller: VehicleController, seen: list[Any]) -> Any:
     """Answer to a row of a `BatchObservation`, without cell and episode."""
-    row, (lateral_m, lateral_mps, overlaps, *rest) = seen[:6], seen[12:]
-    row += [Neighbour(*seen[6:9]), Neighbour(*seen[9:12]), lateral_m, lateral_mps, bool(overlaps), *rest]
-    return controller.step(Observation(*row))
+    bv, lv = Neighbour._make(seen[6:9]), Neighbour._make(seen[9:12])
+    return controller.step(Observation._make((*seen[:6], bv, lv, *seen[12:14], bool(seen[14]), *seen[15:])))
 
 
 def _numbers(n: int, answer: Any) -> tuple[FloatArray | None, str | None]:

@@ -40,8 +40,7 @@ class EpisodeStart:
     bv_name: str = "BV"
 
 
-@dataclass(frozen=True, slots=True)
-class Observation:
+class Observation(NamedTuple):
     """What a per-vehicle controller sees before a step; filled by `harness.loop.drive.observe`.
 
     Attributes
