@@ -49,16 +49,6 @@ class BesideReference:
     preventable_high: Number
 
 
-@dataclass(frozen=True)
-class Unavoidable:
-    """The share of a rate, with limits, on whose events the most careful driver of the library crashes, too."""
-
-    driver: str
-    share: float
-    share_low: float
-    share_high: float
-
-
 def compared(design: ShellDesign, cells: Tally, level: Level) -> tuple[BesideReference, ...]:
     """The vehicle beside each reference that crashes at all; ``cells`` are its tests by the design's cells."""
     found, own = [], float(design.p @ cells.joined(design.joined).share)
@@ -71,15 +61,6 @@ def compared(design: ShellDesign, cells: Tally, level: Level) -> tuple[BesideRef
         error = design.reference_error(r)
         found.append(BesideReference(reference.name, reference.delay_s, rate, error, *ratio, *preventable))
     return tuple(found)
-
-
-def unavoidable(design: ShellDesign, cells: Tally, level: Level) -> Unavoidable | None:
-    """See there; None without a crash, and where that driver crashes nowhere."""
-    if not design.n_inside or not cells.crashes.any():
-        return None
-    avoids = np.asarray(design.cell_stratum) > 0
-    share, low, high = preventable_share(design.cell_p, cells, avoids, design.n_independent, level)
-    return Unavoidable(design.strata[0], 1.0 - share, 1.0 - high, 1.0 - low)
 
 
 def beside(design: ShellDesign, cells: Tally, r: int, n_strata: int, level: Level) -> tuple[float, float]:

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from harness.estimators.beside import Unavoidable, share_of_crashes, unavoidable
+from harness.estimators.beside import share_of_crashes
 from harness.estimators.block import Block
 from harness.estimators.estimate import Accumulator, Number
 from harness.estimators.likelihood import Level
@@ -44,7 +44,7 @@ class Severity:
 
     ``median_mps`` and ``p95_mps`` are quantiles of the speed, ``share_below_1_mps`` and ``share_above_5_mps`` shares of
     the rate; ``exceedance`` has a row for each of `SPEEDS_MPS` above what is counted. Of shells there are ``limits`` of
-    the shares, and ``unavoidable``.
+    the shares.
     """
 
     median_mps: float
@@ -52,7 +52,6 @@ class Severity:
     share_below_1_mps: float
     share_above_5_mps: float
     exceedance: tuple[Exceedance, ...]
-    unavoidable: Unavoidable | None
     limits_below_1_mps: tuple[float, float] | None = None
     limits_above_5_mps: tuple[float, float] | None = None
 
@@ -86,12 +85,11 @@ class Impacts:
         impact, weight = (np.concatenate(column) for column in zip(*self._crashes, strict=True))
         if not impact.size:
             return None
-        every, of_careful = self._above[self._first], None
+        every = self._above[self._first]
         limits: list[tuple[float, float] | None] = [None, None]
         if isinstance(every, SeenShells):
             level, each = Level.two_sided(confidence), every.weight_of_a_crash()
             weight = each[weight.astype(np.int64)]
-            of_careful = unavoidable(every.design, every.cells, level)
             for k, (speed, softer) in enumerate(((TOUCH_MPS, True), (HARD_MPS, False))):
                 if isinstance(harder := self._above.get(speed), SeenShells):
                     limits[k] = share_of_crashes(every.design, every.tally, harder.tally, level, of_the_others=softer)
@@ -100,8 +98,7 @@ class Impacts:
         total, median, high = float(weight.sum()), *weighted_quantiles(impact, weight, (0.5, 0.95))
         below, above = (float(weight[rows].sum()) / total for rows in (impact <= TOUCH_MPS, impact > HARD_MPS))
         rows = tuple(_exceedance(speed, state, confidence) for speed, state in self._above.items())
-        of_all = median, high, below, above, rows, of_careful
-        return Severity(*of_all, limits[0], limits[1])
+        return Severity(median, high, below, above, rows, limits[0], limits[1])
 
     def cut_off(self) -> float:
         """Rate of tests that ended with the AV about to crash (`Block`), whether or not any has crashed."""

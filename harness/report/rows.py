@@ -21,7 +21,6 @@ LEAST_REPLICATES = 100
 """With fewer, quantiles far out in the tails change with their number [assumed]."""
 CLOSE = 0.1
 """Factors closer to 1 than so much on a logarithmic scale are told with three digits."""
-_BRAKES_HARDEST = "brakes-8"
 
 
 @dataclass(frozen=True)
@@ -111,10 +110,6 @@ def _severity(found: Severity, so_far: str) -> Iterator[Row]:
     above = _share_within(found.share_above_5_mps, found.limits_above_5_mps, f" above {plain(HARD_MPS)} m/s")
     below = _share_within(found.share_below_1_mps, found.limits_below_1_mps, f" below {plain(TOUCH_MPS)} m/s")
     yield Row("impact", f"impact speed{so_far}", f"median {tenths(found.median_mps)} m/s", above, below)
-    # What a driver who brakes less hard does not avoid another one may.
-    if (of := found.unavoidable) is not None and of.driver == _BRAKES_HARDEST:
-        ends, why = f"{share(of.share_low, least=0.001)} to {share(of.share_high)}", "even by braking at 8 m/s²"
-        yield Row("unavoidable", f"unavoidable{so_far}", f"{share(of.share)} of the rate", ends, why)
 
 
 def _share_within(value: float, limits: tuple[float, float] | None, of: str) -> str:

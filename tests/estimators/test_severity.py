@@ -18,7 +18,7 @@ from harness.pool.build import campaign_pool
 from harness.resolved import resolve
 from harness.runner.stored import stored_blocks
 from harness.sampling import prepare
-from harness.sampling.shells import ShellRounds, stored_design
+from harness.sampling.shells import ShellRounds
 from harness.vocabulary import CRASH, FAILED, SAMPLING, TIMEOUT
 from harness.worlds.twin import TwinWorld
 from tests.in_process import run_here
@@ -52,16 +52,6 @@ def test_it_is_the_rate_of_harder_crashes_by_the_same_estimator(name, stored_run
     assert severity["median_mps"] == impact[np.searchsorted(share, 0.5)]
     assert severity["share_below_1_mps"] == pytest.approx(weight[crashes.impact_speed_mps <= 1.0].sum() / weight.sum())
     assert severity["share_above_5_mps"] == pytest.approx(weight[crashes.impact_speed_mps > 5.0].sum() / weight.sum())
-
-
-def test_what_nobody_avoids_is_what_the_most_careful_driver_crashes_on(stored_run):
-    folder = stored_run("shells-twin")
-    rows, design = stored_table(folder, "episodes").to_pandas(), stored_design(folder)
-    by_cell = design.cell_p * (rows.outcome == "crash").groupby(rows.cell).mean().reindex(range(design.cell_p.size))
-    found = estimates(folder)["severity"]["unavoidable"]
-    assert found["driver"] == design.strata[0] == "brakes-8"
-    assert found["share"] == pytest.approx(by_cell[np.array(design.cell_stratum) == 0].sum() / by_cell.sum())
-    assert 0.0 < found["share_low"] < found["share"] < found["share_high"] < 1.0
 
 
 @pytest.mark.parametrize("method", ["nde", "shells"])

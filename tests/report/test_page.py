@@ -26,7 +26,7 @@ SEEN = {
     "weighted": ({"severity"}, ["defensive_share: 0.1"]),
     "no_crash": (set(), ["No crash was seen."]),
     "nde": ({"severity"}, []),
-    "shells": ({"severity", "shells"}, ["even by braking at 8 m/s²", "tests FAILED", "step: returned nan, expected"]),
+    "shells": ({"severity", "shells"}, ["tests FAILED", "step: returned nan, expected"]),
     "shells_refuted": ({"severity", "shells"}, ["refuted by these tests; by test", "outermost no. 1"]),
 }
 """Plots, and words that no other kind of run has."""

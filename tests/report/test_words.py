@@ -23,7 +23,7 @@ SAID = {
         " of 240 tests FAILED; had they all crashed, as upper limits assume, the rate would be ",
         "; most with: ",
     ],
-    "shells-twin": ["crash rate  ", "× competent driver  ", "r157-cc, UN R157’s driver", "even by braking at 8 m/s²"],
+    "shells-twin": ["crash rate  ", "× competent driver  ", "r157-cc, UN R157’s driver", "impact speed  "],
     "shells-accepted": [
         "ACCEPTED ",
         "rate below 4 × 10⁻⁷ per test",
@@ -31,7 +31,7 @@ SAID = {
         "stopped: verdict reached",
     ],
     "shells-refuted": ["138 (crashes more)", "stopped: all tests done"],
-    "shells-inside": ["given the library ", "no tests outside it", "crash rate so far", "unavoidable so far"],
+    "shells-inside": ["given the library ", "no tests outside it", "crash rate so far", "impact speed so far"],
     "shells-acting-twin": ["tests.golden.vehicles:Speeds · 240 tests in SUMO’s twin", "r157-cc, from the same state"],
     "forced-inattentive": ["fvdm (reaction.delay_s 0.2, "],
     "forced-krauss": ["SUMO’s Krauss · 240 tests in SUMO"],
@@ -122,7 +122,7 @@ def test_a_rate_that_counts_no_crash_where_nothing_was_tested_says_so(name, unte
     assert (rate["what"] == "crash rate so far") == untested
     assert rate["remark"].endswith(" per million km")
     assert not rows["ratio"]["value"].startswith("≥")
-    assert (rows["unavoidable"]["what"] == "unavoidable so far") == untested
+    assert (rows["impact"]["what"] == "impact speed so far") == untested
 
 
 def test_what_a_missed_precision_takes_is_told_once(stored_run):
