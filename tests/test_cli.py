@@ -66,7 +66,7 @@ def test_run_prints_the_answer_and_where_more_is(folder, capsys):
         manifest(folder)["wall_time_s"],
         folder / "report.html",
     )
-    assert (out, len(out)) == (short, 7)
+    assert (out, len(out)) == (short, 6)
     assert main([*command, "--json"]) == 0
     assert json.loads(capsys.readouterr().out) == content
 
