@@ -135,8 +135,9 @@ class Bar:
 
 
 def tests_of_sum(content: Mapping[str, Any]) -> str:
-    """What the tests of several scenarios are known by, in the place of a campaign's hash."""
-    return f"{content.get('campaign_crc32')}-{content['n_episodes']}"
+    """What the sum of several scenarios is known by, in the place of a campaign's hash: its tests and exposures."""
+    exposures = (f"{of['exposure']['per_hour']:g}" for of in content["families"].values())
+    return "-".join([f"{content.get('campaign_crc32')}", f"{content['n_episodes']}", *exposures])
 
 
 @dataclass(frozen=True)

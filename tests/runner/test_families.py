@@ -275,6 +275,9 @@ def test_what_moves_one_scenario_moves_the_sum_by_its_share(run, tmp_path, monke
     assert again.content["per_hour"] == told["per_hour"]
     assert main(["report", str(folder)]) == 0
     assert 'id="plot-sensitivity"' in (folder / "report.html").read_text()
+    assert main(["estimate", str(folder), "--exposure", "lead_brakes=0.3", "--write"]) == 0
+    assert main(["report", str(folder)]) == 0
+    assert 'id="plot-sensitivity"' not in (folder / "report.html").read_text()  # it is of other exposures
     assert main(["sensitivity", str(folder), "--range", "braking.stop_shar=0:0.1"]) == 2
     assert "found:    braking.stop_shar" in capsys.readouterr().err
 
