@@ -42,8 +42,9 @@ def checked(name: str) -> Callable[[Callable[P, R]], Callable[P, R]]:
                 bound = takes.bind(*given, **named)
             except TypeError as error:
                 unknown = next((key for key in named if key not in takes.parameters), "")
-                mend = did_you_mean(unknown, list(takes.parameters)) or "Correct the call."
-                raise HarnessError(name, str(error), f"arguments {', '.join(takes.parameters)}", mend) from None
+                mend = did_you_mean(unknown, list(takes.parameters)) or "Correct the call: what has a = goes by name."
+                told = (f"{of.name}{'=' * (of.kind is of.KEYWORD_ONLY)}" for of in takes.parameters.values())
+                raise HarnessError(name, str(error), f"arguments {', '.join(told)}", mend) from None
             for key in bound.arguments.keys() & adapters.keys():
                 bound.arguments[key] = _checked(f"{name}({key}=…)", bound.arguments[key], *adapters[key])
             return function(*bound.args, **bound.kwargs)

@@ -79,6 +79,7 @@ RUN = "shells-twin"
         (lambda _: harness.run("idm", "out", workers=0), "harness.run(workers=", "found 0; expected greater than"),
         (lambda _: harness.run("idm", "out", progress=print), "harness.run(progress=", "an instance of Progress"),
         (lambda _: harness.run("idm", "out", worker=2), "harness.run:", "Did you mean 'workers'?"),
+        (lambda run: harness.estimate(run, ["nade"]), "harness.estimate:", "arguments folder, estimators="),
         (lambda _: harness.load_campaign("smoke.yaml", "stop.rhw=.1"), "(overrides=", "Write ['stop.rhw=.1']."),
         (lambda run: harness.estimate(run, confidence=math.nan), "(confidence=", "found nan"),
         (lambda run: harness.replay(run, np.int64(-1)), "harness.replay(episode=", "found -1"),
