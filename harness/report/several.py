@@ -282,10 +282,10 @@ def pair_lines(
         of, label = rates_of(content[name.lower()]), content["campaigns"][name.lower()]["label"]
         label = label.removeprefix(f"{content['campaigns']['a']['label']}, ").replace("av.parameters.", "")
         rate, ends = number(of["rate"]), interval(of["ci_low"], of["ci_high"], beside=of["rate"])
-        if not of["n_crashes"]:
+        if not (n := of["n_crashes"]):
             rate, ends = f"< {number(of['upper_bound'])}", "no crash seen"
         label = label if len(label) <= words.LABEL else f"{label[: words.LABEL - 2]} …"
-        rows.append((f"{name} {label}", rate, ends, f"{count(of['n_crashes'])} crashes"))
+        rows.append((f"{name} {label}", rate, ends, f"{count(n)} crash{'es' * (n != 1)}"))
     looks = f"verdict: confidence {plain(content['decision']['confidence'])} over all looks"
     rows.append(("A / B", *ratio_words(asked), looks))
     ends = interval(asked["ci_low"], asked["ci_high"], beside=asked["difference"])
