@@ -13,7 +13,7 @@ from harness.errors import RunFolderError
 from harness.numbers import interval, number, ratio
 from harness.report.crashes import crashing_pairs
 from harness.report.plots import WHO
-from harness.report.several import deciding_words, pair_lines
+from harness.report.several import deciding_words, pair_lines, ratio_words
 from harness.report.summary import read_run_folder
 from harness.runner.stored import write_report
 from tests.families.test_same_bits import SMALL
@@ -138,3 +138,8 @@ def test_who_crashes_before_the_event_is_compared_and_shown(tmp_path):
     assert re.fullmatch(
         rf"crashes at [\d.]+ s, before anything happens: strikes LV .*: impact {impact:.1f} m/s", facts[1][1]
     )
+
+
+def test_a_ratio_to_one_that_has_not_crashed_has_a_lower_end_alone():
+    assert ratio_words({"ratio": None, "ratio_low": 3.2, "ratio_high": None}) == ("–", "≥ 3.20")
+    assert ratio_words({"ratio": None, "ratio_low": 0.0, "ratio_high": None}) == ("–", "")
