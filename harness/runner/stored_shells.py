@@ -90,7 +90,7 @@ class StoredShells:
 
     @property
     def limit_mps2(self) -> float:
-        """Hardest acceleration of the vehicle."""
+        """Hardest acceleration that its strata allow for."""
         return tested_limit(self.here.campaign)
 
     @cached_property
