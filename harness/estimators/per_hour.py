@@ -223,14 +223,16 @@ class PerHour:
         return self.ratio(level)[1:]
 
     def over_assumed(self) -> tuple[float, float] | None:
-        """The least and the largest ratio over all ends of what is assumed; None where that driver never crashes."""
-        ratios = []
-        for rates in product(*(of.over_assumed() for of in self.families)):
-            mine, theirs = (math.fsum(each) for each in zip(*rates, strict=True))
-            if theirs <= 0.0:
-                return None
-            ratios.append(mine / theirs)
-        return min(ratios), max(ratios)
+        """The least and the largest ratio over all ends of what is assumed.
+
+        None where that driver never crashes, or in some family no test has: the rate there, and so the range, is open.
+        """
+        if not all(of.rate for of in self.families):
+            return None
+        ends = product(*(of.over_assumed() for of in self.families))
+        sums = [[math.fsum(each) for each in zip(*rates, strict=True)] for rates in ends]
+        ratios = [mine / theirs for mine, theirs in sums if theirs > 0.0]
+        return (min(ratios), max(ratios)) if len(ratios) == len(sums) else None
 
     def limits_over_assumed(self, level: Level, *, ratio: bool) -> tuple[float, float]:
         """The outermost limits of the rate, or of `ratio`, over both ends of each assumed exposure."""

@@ -141,6 +141,8 @@ def test_ratio_to_the_competent_driver_and_what_assumed_exposures_do_to_it():
             moved = hour.with_exposures({"lead_brakes": lead, "cut_out": out})
             ends.append(moved.rate / moved.reference_rate)
     assert hour.over_assumed() == pytest.approx((min(ends), max(ends)))
+    no_crash = family("cut_out", [1e-6, 1e-3], [10, 36], [0, 0], THREE[2].exposure, CC)
+    assert PerHour([*THREE[:2], no_crash]).over_assumed() is None  # its rate is open, and so is what it moves
     assert math.isnan(PerHour([family("a", [1.0, 1.0], [9, 9], [1, 0], ASSUMED)]).ratio(LEVEL)[0])
 
 
