@@ -13,6 +13,7 @@ from harness.campaign.sections import EnvironmentSettings
 from harness.cli import main
 from harness.estimators.limits import garwood
 from harness.families import family_named
+from harness.families.cut_out.fitting import EVENT as OF_CUT_OUT
 from harness.families.cut_out.fitting import CutOutFitter, time_law
 from harness.families.following.fitting import TAIL, Seen
 from harness.families.lead_brakes.fitting import EVENT, MOST_NOISE_MPS2, BrakingFitter, tail_scale
@@ -196,6 +197,19 @@ def test_that_data_exclude_an_exposure_that_is_kept_stands_in_the_file(hours, ex
     exposure = family.exposure(family.traffic(EnvironmentSettings(), parameters), parameters)
     assert (exposure.per_hour, exposure.counted) == (pytest.approx(0.1), None)
     assert (f"; {EXCLUDED}: 0 in 200 h" in exposure.source) == excluded
+    assert "in scope" not in found.told[0]  # all are
+
+
+def test_of_cut_outs_those_in_scope_are_told_as_a_campaign_counts_them(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    fitter, family = CutOutFitter(), family_named("cut_out")
+    fitter._seen = [Seen(2.0, np.zeros(7, OF_CUT_OUT))]  # too few for a law
+    found = fitter.fitted(SimpleNamespace(out=Path("mine.yaml"), provenance=list), {})
+    ((file, content),) = found.files.items()
+    file.write_bytes(content)
+    parameters = family.parameters(EnvironmentSettings(parameters=f"./{file}"))
+    exposure = family.exposure(family.traffic(EnvironmentSettings(), parameters), parameters)
+    assert f"; in scope, as --exposure takes them: {exposure.per_hour:.3g} per hour" in found.told[0]
 
 
 @pytest.mark.slow
@@ -210,7 +224,7 @@ def test_what_a_fit_writes_is_what_a_campaign_reads(tmp_path, monkeypatch, capsy
     told = capsys.readouterr().out
     assert "cut_out: 3 cut-outs that reveal a slower vehicle within 12 s in" in told
     assert "at least 5 are needed, some" in told
-    assert "kept is 1.00 per hour, in scope or not [assumed], and the law of cut-out-1" in told
+    assert "kept is 1.00 per hour [assumed], and the law of cut-out-1" in told
     assert "peak_scale_mps2" in told
     page = (tmp_path / "mine.html").read_text()
     assert "lead_brakes: " in page

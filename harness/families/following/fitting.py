@@ -105,6 +105,7 @@ class FollowingFitter:
             told += "; " + ", ".join(f"{name} {number(each['value'])} ± {number(each['se'], 2)}" for name, each in of)
         elif events.size >= FEWEST_COUNTED:
             told += f"; a law takes {FEWEST_OF_LAW}: kept is that of {base}"
+        told += self._in_scope(content)
         silent, n = [each.why for each in self._seen if each.why], len(self._seen)
         more = [f"! {self.family.name}: {len(silent)} of {n} recordings are not counted: {silent[0]}"] if silent else []
         head = [f"{n - len(silent)} recordings.", told, f"The rest is as in {base}.", *asked.provenance()]
@@ -130,7 +131,16 @@ class FollowingFitter:
         content: Numbers = {"exposure": {"per_hour": kept.model_dump(exclude_none=True) | seen}} if outside else {}
         excluded = ", which these data exclude" if outside else ""
         told += f" ({limits} per hour)" * (hours > 0.0)
-        told += (
-            f"; at least {FEWEST_COUNTED} are needed{needed}: kept is {number(kept.value)} per hour, in scope or not"
-        )
+        told += f"; at least {FEWEST_COUNTED} are needed{needed}: kept is {number(kept.value)} per hour"
         return content, f"{told} [{kept.source}]{excluded}, and the law of {self.family.default_parameters}"
+
+    def _in_scope(self, content: Numbers) -> str:
+        """Which part of the rate is tested, where that is not all."""
+        settings = EnvironmentSettings()
+        kept = self.family.parameters(settings)
+        numbers = {f"{of}__{name}": each for of, own in content.items() for name, each in own.items()}
+        values = {name: each["value"] for name, each in numbers.items() if isinstance(each, dict)}
+        traffic = self.family.traffic_with(settings, kept, values)
+        every = values.get("exposure__per_hour", kept.exposure.per_hour.value)
+        tested = number(every * (1.0 if traffic is None else self.family.share_in_scope(traffic)))
+        return "" if tested == number(every) else f"; in scope, as --exposure takes them: {tested} per hour"
