@@ -286,7 +286,10 @@ def pair_lines(
             rate, ends = f"< {number(of['upper_bound'])}", "no crash seen"
         label = label if len(label) <= words.LABEL else f"{label[: words.LABEL - 2]} …"
         rows.append((f"{name} {label}", rate, ends, f"{count(n)} crash{'es' * (n != 1)}"))
-    looks = f"verdict: confidence {plain(content['decision']['confidence'])} over all looks"
+    decision = content["decision"]
+    apart = not (asked["ratio_low"] or 0.0) < 1.0 < (asked["ratio_high"] or math.inf)
+    one_look = "; interval: of one look" * (apart and decision["verdict"] == "open")
+    looks = f"verdict: confidence {plain(decision['confidence'])} over all looks{one_look}"
     rows.append(("A / B", *ratio_words(asked), looks))
     ends = interval(asked["ci_low"], asked["ci_high"], beside=asked["difference"])
     rows.append(("A − B", number(asked["difference"]), ends, alone_words(asked)))
@@ -303,7 +306,7 @@ def pair_lines(
     counted = f" above {plain(above)} m/s" if (above := campaign.crash.counts_above_mps) else ""
     scenarios, unit = (scenarios_words(families), "hour") if families else (called(campaign.scenario), "test")
     pairs = f"{count(content['n_pairs'])} pairs of tests, {scenarios}"
-    head = f"{pair_words(content['decision'])} · {pairs} · crashes{counted} per {unit}"
+    head = f"{pair_words(decision)} · {pairs} · crashes{counted} per {unit}"
     last = [*filter(None, [deciding_words(content, s_per_pair)]), scope]
     under = words.wrapped([*(remarks if families else words.few(remarks, 4 - len(last))), *last])
     return [head, *words.columns(rows), *parts, *under, f"  report  {report}"]

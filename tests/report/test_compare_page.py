@@ -63,6 +63,19 @@ def test_what_differs_is_never_cut_off_in_a_terminal(compared):
     assert b.startswith("  B hardest_mps2=9  ")
 
 
+@pytest.mark.parametrize(("low", "high", "verdict", "said"), [
+    (0.51, 0.88, "open", True), (0.51, 1.1, "open", False), (1.2, None, "open", True), (0.51, 0.88, "refuted", False),
+])  # fmt: skip
+def test_an_interval_that_excludes_1_beside_an_open_verdict_says_that_it_is_of_one_look(
+    compared, low, high, verdict, said
+):
+    found = content_of(compared)
+    found |= {"ratio": low, "ratio_low": low, "ratio_high": high, "to_decide": None}
+    found["decision"] |= {"verdict": verdict, "margin": None}
+    _, _, _, ratio_row, *_ = pair_lines(found, read_run_folder(compared / "a").campaign, compared)
+    assert ratio_row.endswith("over all looks; interval: of one look") == said
+
+
 def test_the_map_holds_each_pair_with_a_crash(compared, page):
     found, runs = content_of(compared), [read_run_folder(compared / side) for side in "ab"]
     pairs = crashing_pairs(runs, found["shells"])
