@@ -260,7 +260,7 @@ def design_shells(pool: Pool, limit_mps2: float) -> ShellDesign:
         p_event_se=pool.p_event_se,
         p_held=None if math.isnan(pool.p_held) else pool.p_held,
         p_held_se=pool.p_held_se,
-        p_unreachable=pool.p_event - float(p.sum()),
+        p_unreachable=max(pool.p_event - float(p.sum()), 0.0),
         shadow_runs=(acts := pool.events.acts),
         candidates=CANDIDATES if acts else 0,
     )
