@@ -1,16 +1,11 @@
-"""Results as Python shows them: a short answer, in a notebook with what there is to see below it.
-
-What they show is the report's, which is imported when something is shown: `run` and `estimate` draw nothing.
-"""
+"""Results as Python shows them: a short answer, in a notebook with what there is to see below it."""
 
 from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Iterable
-from typing import TYPE_CHECKING
 
-if TYPE_CHECKING:
-    from harness.report.drawing import Plot
+from harness.report.drawing import Plot, shown_with
 
 
 class ShownInPython:
@@ -28,6 +23,4 @@ class ShownInPython:
         return "\n".join(self._lines())
 
     def _repr_html_(self) -> str:
-        from harness.report.drawing import shown_with  # noqa: PLC0415 - see above
-
         return shown_with(repr(self), self._plot())

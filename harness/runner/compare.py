@@ -10,7 +10,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 from pydantic import Field
 
@@ -31,6 +31,11 @@ from harness.pool.shells import tested_limit
 from harness.progress import Progress
 from harness.records.folder import CAMPAIGN, read_manifest, require_sum, write_sealed
 from harness.records.reader import code_of, require_trust
+from harness.report.crashes import crashing_pairs
+from harness.report.drawing import Plot
+from harness.report.page import write_comparison, write_comparison_of_sum
+from harness.report.several import pair_lines
+from harness.report.summary import RunFolder
 from harness.report.words import doubts_of
 from harness.resolved import Resolved, require_ready
 from harness.runner.paired import SIDES, Both, PairedScenario, copy_stored, drive_pairs, together
@@ -41,10 +46,6 @@ from harness.sampling.shells import PairRounds
 from harness.shown import ShownInPython
 from harness.strata import ASSUMPTION_FREE, LIBRARY_STATEMENT
 from harness.vocabulary import COMPARISON, FAMILIES
-
-if TYPE_CHECKING:
-    from harness.report.drawing import Plot
-    from harness.report.summary import RunFolder
 
 MAY_DIFFER = frozenset({"av", "name", "description"})
 
@@ -65,16 +66,12 @@ class Comparison(ShownInPython):
     """What the page is made of, of A and of B."""
 
     def _lines(self) -> list[str]:
-        from harness.report.several import pair_lines  # noqa: PLC0415 - draws
-
         last = self.shown[1]
         s_per_pair = last.manifest["wall_time_s"] / self.content["n_pairs"]
         return pair_lines(self.content, last.campaign, self.report, s_per_pair)
 
     def _plot(self) -> Plot | None:
         """Events on which one of them crashes."""
-        from harness.report.crashes import crashing_pairs  # noqa: PLC0415 - draws
-
         if "shells" not in self.content:  # of several scenarios, each of which has its own map
             return None
         return crashing_pairs(self.shown, self.content["shells"]).plot(family_named(self.shown[0].campaign.scenario))
@@ -206,8 +203,6 @@ def _written(
     for side, each in zip(SIDES, of.results, strict=True):
         content[side] |= finite_json(doubts_of(each.shown.campaign, each.shown.manifest, each.shown.estimates))
     write_sealed(of.folder / COMPARISON, content)
-    from harness.report.page import write_comparison  # noqa: PLC0415 - draws
-
     shown = [each.shown for each in of.results]
     return Comparison(of.folder, content, code, write_comparison(of.folder, content, shown, replay_episode), shown)
 
@@ -239,8 +234,6 @@ def _sum_written(
         },
     })  # fmt: skip
     write_sealed(out / COMPARISON, content)
-    from harness.report.page import write_comparison_of_sum  # noqa: PLC0415 - draws
-
     shown = [each.shown for of in scenarios for each in of.results]
     return Comparison(out, content, code, write_comparison_of_sum(out, content), shown)
 

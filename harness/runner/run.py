@@ -31,6 +31,8 @@ from harness.printed import PRINTED
 from harness.problems import listed
 from harness.progress import Progress
 from harness.records.folder import CAMPAIGN, SENSITIVITY, sole_use, write_bytes, write_sealed
+from harness.report.page import write_hours
+from harness.report.several import hour_lines
 from harness.report.words import doubts_of, vehicle_words
 from harness.resolved import Resolved, require_ready
 from harness.runner.underway import Places, RunResult, begun, doubted, exit_code, taken
@@ -108,8 +110,6 @@ class Hours(ShownInPython):
     exit_code: int
 
     def _lines(self) -> list[str]:
-        from harness.report.several import hour_lines  # noqa: PLC0415 - draws
-
         return hour_lines(self.content, self.report)
 
 
@@ -135,8 +135,6 @@ def run_families(campaign: Campaign, out: Path, *, workers: int | None, resume: 
     missed = campaign.stop.rhw is not None and not rule.look.stopped
     told = {name: (each.shown.estimates, each.shown.manifest) for name, each in results.items()}
     answer = hour_answer(hour, ready, told, campaign.stop.confidence)
-    from harness.report.page import write_hours  # noqa: PLC0415 - draws
-
     vehicle, parameters = vehicle_words(campaign.av, script=next(iter(ready.values())).script)
     asked = {
         "format": 1, "name": campaign.name, "campaign_crc32": zlib.crc32(yaml),

@@ -7,7 +7,7 @@ from contextlib import closing
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import pyarrow as pa
 import pyarrow.compute as pc
@@ -31,6 +31,14 @@ from harness.records import reader
 from harness.records.folder import CAMPAIGN, ESTIMATES, Part, no_episodes, read_as, read_kept, read_manifest
 from harness.records.reader import N_READERS, code_of, read_campaign, require_campaign, require_trust, traffic_of
 from harness.records.schemas import moments_schema, shard_tables
+from harness.report.crashes import COMPARE_AGAIN
+from harness.report.drawing import Plot
+from harness.report.page import write_comparison, write_comparison_of_sum, write_hours, write_page_of
+from harness.report.player import ReplayResult, Scenes, with_lateral
+from harness.report.plots import where_plot
+from harness.report.several import hour_lines
+from harness.report.summary import read_run_folder
+from harness.report.words import estimate_lines, run_lines
 from harness.resolved import Resolved, require_world, resolve
 from harness.runner.kept import cpu_name, require_same_pool, versions
 from harness.runner.run import exposure_of, hour_answer
@@ -40,10 +48,6 @@ from harness.sampling.shells import stored_design
 from harness.shown import ShownInPython
 from harness.vocabulary import COMPARISON, ESTIMATORS, FAMILIES
 from harness.worlds import build_world
-
-if TYPE_CHECKING:
-    from harness.report.drawing import Plot
-    from harness.report.player import ReplayResult
 
 _FINISH = "Run `harness run` with --resume, which makes missing tests."
 
@@ -56,9 +60,6 @@ class StoredEstimates(ShownInPython, dict[str, Any]):
         self._folder, self._by_estimator = folder, by_estimator
 
     def _lines(self) -> list[str]:
-        from harness.report.several import hour_lines  # noqa: PLC0415 - draws
-        from harness.report.words import estimate_lines, run_lines  # noqa: PLC0415
-
         if self._by_estimator or "families" in self:
             return estimate_lines(self) if self._by_estimator else hour_lines(self)
         folder, manifest = self._folder, read_manifest(self._folder)
@@ -66,9 +67,6 @@ class StoredEstimates(ShownInPython, dict[str, Any]):
 
     def _plot(self) -> Plot | None:
         """The map of its tests, where what is told is of their own traffic."""
-        from harness.report.plots import where_plot  # noqa: PLC0415 - draws
-        from harness.report.summary import read_run_folder  # noqa: PLC0415
-
         none = self.get("elsewhere") or "families" in self
         return None if none else where_plot(read_run_folder(self._folder, self))
 
@@ -205,8 +203,6 @@ def replay_episode(
 
 
 def _result(campaign: Campaign, traffic: Environment | None, tables: Mapping[str, pa.Table]) -> ReplayResult:
-    from harness.report.player import ReplayResult, Scenes, with_lateral  # noqa: PLC0415 - `run` and `estimate` draw nothing
-
     (row,), traces = tables["episodes"].to_pylist(), tables["traces"]
     scene = Scenes(campaign, traffic).scene(tables["episodes"], traces)
     traces = with_lateral(tables["episodes"], traces, family_named(campaign.scenario), traffic)
@@ -361,9 +357,6 @@ def write_report(folder: str | Path) -> Path:
 
     Raises `RunFolderError`: if the folder misses a file, or a file is damaged or belongs to another run.
     """
-    from harness.report.page import write_hours, write_page_of  # noqa: PLC0415 - draws
-    from harness.report.summary import read_run_folder  # noqa: PLC0415
-
     if (Path(folder) / COMPARISON).is_file():
         return _write_comparison(Path(folder))
     if (Path(folder) / FAMILIES).is_file():
@@ -373,10 +366,6 @@ def write_report(folder: str | Path) -> Path:
 
 def _write_comparison(folder: Path) -> Path:
     """Of the comparison, and of each scenario's where it is a sum."""
-    from harness.report.crashes import COMPARE_AGAIN  # noqa: PLC0415 - draws
-    from harness.report.page import write_comparison, write_comparison_of_sum  # noqa: PLC0415
-    from harness.report.summary import read_run_folder  # noqa: PLC0415
-
     stored = read_as(dict[str, Any], folder / COMPARISON, mend=COMPARE_AGAIN)
     if "families" in stored:
         for name in stored["families"]:

@@ -20,14 +20,13 @@ from harness.processes import made_ahead
 from harness.records.folder import ESTIMATES, SHELLS, concatenated, no_episodes, read_as, read_kept, read_manifest
 from harness.records.reader import N_READERS, read_campaign
 from harness.records.schemas import traces_schema
+from harness.report.drawing import Plot
 from harness.runner.stored import StoredEstimates
 from harness.shown import ShownInPython
 from harness.vocabulary import IntArray
 
 if TYPE_CHECKING:
     import pandas as pd
-
-    from harness.report.drawing import Plot
 
 TableName = Literal["episodes", "moments", "traces"]
 

@@ -11,7 +11,7 @@ from dataclasses import asdict, dataclass, replace
 from functools import partial
 from itertools import chain
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import pyarrow as pa
 
@@ -34,6 +34,11 @@ from harness.pool.shells import PrescribedEpisodes
 from harness.progress import Progress
 from harness.records.folder import ESTIMATES, MILDER, SHELLS, parquet, sole_use, write_sealed
 from harness.records.reader import ShownTests
+from harness.report.drawing import Plot
+from harness.report.page import write_page_of
+from harness.report.plots import where_plot
+from harness.report.summary import RunFolder
+from harness.report.words import run_lines
 from harness.resolved import Resolved
 from harness.runner.kept import (
     SMALLEST_FAILED_SAMPLE,
@@ -62,10 +67,6 @@ from harness.shown import ShownInPython
 from harness.signals import uninterrupted
 from harness.strata import STORED_DESIGN
 from harness.vocabulary import IntArray, StoppedBy
-
-if TYPE_CHECKING:
-    from harness.report.drawing import Plot
-    from harness.report.summary import RunFolder
 
 _EXIT_OF: Mapping[Verdict | PairVerdict, int] = {
     "accepted": EXIT_DONE, "rejected": EXIT_REFUTED, "undecided": EXIT_BUDGET_SPENT,
@@ -96,13 +97,9 @@ class RunResult(ShownInPython):
     """What its page is made of."""
 
     def _lines(self) -> list[str]:
-        from harness.report.words import run_lines  # noqa: PLC0415 - draws
-
         return run_lines(self.shown.campaign, self.shown.manifest, self.shown.estimates, self.report)
 
     def _plot(self) -> Plot | None:
-        from harness.report.plots import where_plot  # noqa: PLC0415 - draws
-
         return where_plot(self.shown)
 
 
@@ -233,9 +230,6 @@ class Underway:
         manifest = run.content("done", **ended)
         estimates = estimate_blocks(even(run.blocks), campaign, manifest)
         write_sealed(run.folder / ESTIMATES, estimates)
-        from harness.report.page import write_page_of  # noqa: PLC0415 - draws
-        from harness.report.summary import RunFolder  # noqa: PLC0415
-
         tests, traffic = ShownTests.joined(run.shown, run.folder), run.resolved.environment
         told = STORED_ESTIMATES.validate_python(estimates)
         shown = RunFolder(run.folder, campaign, manifest, told, run.source.design, tests, traffic)
