@@ -27,22 +27,7 @@ from harness.campaign.files import dump_campaign
 from harness.errors import RunFolderError, TooManyFailedError
 from harness.estimators.block import Block
 from harness.numbers import leaves
-from harness.records.folder import (
-    CAMPAIGN,
-    MANIFEST,
-    SHADOW,
-    SHELLS,
-    Part,
-    Repeated,
-    Tables,
-    read_as,
-    read_kept,
-    read_manifest,
-    remove_unlisted,
-    write_bytes,
-    write_part,
-    write_sealed,
-)
+from harness.records import folder as records
 from harness.records.reader import ShownTests, by_kind, read_campaign, signature
 from harness.resolved import Resolved
 from harness.runner.workers import ShardResult
@@ -65,11 +50,11 @@ class Earlier:
 
     def __init__(self, folder: Path, manifest: Mapping[str, Any]) -> None:
         self._folder = folder
-        self.parts: list[Part] = manifest["parts"]
+        self.parts: list[records.Part] = manifest["parts"]
         self.n_episodes: int = manifest["n_episodes"]
-        self._read: tuple[Part, Tables | None] | None = None
+        self._read: tuple[records.Part, records.Tables | None] | None = None
 
-    def tables(self, first: int, n: int) -> Tables | None:
+    def tables(self, first: int, n: int) -> records.Tables | None:
         """Tables of consecutive tests; None where there are too few, or a file is gone; refused if one is damaged."""
         found = [self._tables(part) for part in self.parts if part.first_episode < first + n and part.end > first]
         if first + n > self.n_episodes or not found or None in found:
@@ -81,10 +66,11 @@ class Earlier:
                 rows.setdefault(name, []).append(table.slice(low, high - low))
         return {name: pa.concat_tables(tables) for name, tables in rows.items()}
 
-    def _tables(self, part: Part) -> Tables | None:
+    def _tables(self, part: records.Part) -> records.Tables | None:
         if self._read is None or self._read[0] is not part:
             there = all((self._folder / file.path).exists() for file in part.files.values())
-            self._read = part, {name: read_kept(self._folder, part, name) for name in part.files} if there else None
+            read = {name: records.read_kept(self._folder, part, name) for name in part.files} if there else None
+            self._read = part, read
         return self._read[1]
 
 
@@ -102,15 +88,15 @@ class Run:
     earlier: Earlier
     began: float
     facts: Mapping[str, Any]
-    parts: tuple[Part, ...] = ()
+    parts: tuple[records.Part, ...] = ()
     open: tuple[ShardResult, ...] = ()
     blocks: tuple[Block, ...] = ()
     shown: tuple[ShownTests, ...] = ()
     """What the page shows of them, causes of failures among it."""
-    repeated: Repeated | None = None
+    repeated: records.Repeated | None = None
     before: Mapping[str, tuple[pa.Table, ...]] = field(default_factory=dict)
     """What comes before tests that count, by table; ``parts_before`` are written, by an earlier run if need be."""
-    parts_before: Mapping[str, Part] = field(default_factory=dict)
+    parts_before: Mapping[str, records.Part] = field(default_factory=dict)
     wrote: tuple[float, float] = (0.0, 0.0)
     """When it was written last, and how long that took (s)."""
     is_named: bool = False
@@ -177,10 +163,10 @@ class Run:
             content |= {"parts": [asdict(part) for part in run.parts], "before": before}
             if not run.is_named:
                 # Until it is there no checksum is told: not of the old one, nor of this.
-                write_sealed(run.folder / MANIFEST, {**content, "campaign_crc32": None})
-                write_bytes(run.folder / CAMPAIGN, dump_campaign(run.resolved.campaign).encode())
-            write_sealed(run.folder / MANIFEST, content)
-            remove_unlisted(run.folder, [*run.parts, *run.parts_before.values()])
+                records.write_sealed(run.folder / records.MANIFEST, {**content, "campaign_crc32": None})
+                records.write_bytes(run.folder / records.CAMPAIGN, dump_campaign(run.resolved.campaign).encode())
+            records.write_sealed(run.folder / records.MANIFEST, content)
+            records.remove_unlisted(run.folder, [*run.parts, *run.parts_before.values()])
             run = replace(run, is_named=True)
         return replace(run, wrote=(time.monotonic(), time.monotonic() - began))
 
@@ -190,13 +176,14 @@ class Run:
         for name, tables in self.before.items():
             n = sum(table.num_rows for table in tables)
             if name not in parts_before or n > parts_before[name].n_episodes:
-                parts_before[name] = write_part(self.folder, [{name: table} for table in tables], 0, n)
+                parts_before[name] = records.write_part(self.folder, [{name: table} for table in tables], 0, n)
         if not self.open:
             return replace(self, parts_before=parts_before)
         first = self.open[0].request.first_episode
         listed = [part for part in self.earlier.parts if (part.first_episode, part.end) == (first, self.n_episodes)]
         if any(shard.is_new for shard in self.open) or not listed:
-            listed = [write_part(self.folder, [each.tables for each in self.open], first, self.n_episodes - first)]
+            shards = [each.tables for each in self.open]
+            listed = [records.write_part(self.folder, shards, first, self.n_episodes - first)]
         parts = (*(part for part in self.parts if part.first_episode < first), *listed)
         return replace(self, parts=parts, parts_before=parts_before)
 
@@ -226,7 +213,7 @@ class Run:
 
     def content(self, status: str, **of_the_end: Any) -> dict[str, Any]:
         """What the manifest says."""
-        repeated, campaign, shadow = self.repeated, self.resolved.campaign, self.before.get(SHADOW, ())
+        repeated, campaign, shadow = self.repeated, self.resolved.campaign, self.before.get(records.SHADOW, ())
         n_failed = sum(len(table) - table["failure"].null_count for table in shadow)
         failures = by_kind(sum((each.causes for each in self.shown), Counter[str]())).most_common(1)
         return {
@@ -257,7 +244,7 @@ def take_over(
     began -= float(earlier.get("wall_time_s") or 0.0)
     listed = earlier["before"].items()
     there = {name: part for name, part in listed if (folder / part.files[name].path).exists()}
-    repeated = Repeated(**known) if (known := earlier.get("repeated")) else None
+    repeated = records.Repeated(**known) if (known := earlier.get("repeated")) else None
     held = Earlier(folder, earlier)
     return Run(folder, resolved, source, held, began, of_run, repeated=repeated, parts_before=there).written()
 
@@ -312,15 +299,14 @@ def require_own_folder(folder: Path, resolved: Resolved, *, resume: bool) -> dic
     if not any(folder.iterdir()):
         return nothing
     elsewhere = "Choose another folder with --out."
-    if not (folder / MANIFEST).exists():
+    if not (folder / records.MANIFEST).exists():
         expected = "a new or empty folder, or one that a run has left"
         several = (folder / FAMILIES).exists()
         raise refusal("a run of several scenarios" if several else "a folder with other files", expected, elsewhere)
-    manifest = read_manifest(folder, mend=elsewhere)
+    manifest = records.read_manifest(folder, mend=elsewhere)
     if manifest["campaign_hash"] != resolved.content_hash:
-        mend = (
-            f"Choose another folder with --out, or go on by `harness run {folder / CAMPAIGN} --out {folder} --resume`."
-        )
+        again = f"harness run {folder / records.CAMPAIGN} --out {folder} --resume"
+        mend = f"Choose another folder with --out, or go on by `{again}`."
         held = read_campaign(folder, manifest)
         there, here = (dict(leaves(each.model_dump(exclude={"name", "stop"}))) for each in (held, resolved.campaign))
         apart = [f"{key} {there.get(key)}" for key in there | here if there.get(key) != here.get(key)][:3]
@@ -340,10 +326,10 @@ def require_own_folder(folder: Path, resolved: Resolved, *, resume: bool) -> dic
 
 def require_same_pool(folder: Path, source: Source) -> None:
     """Refuse (`RunFolderError`) to go on with a run whose events came from another pool, as of another library."""
-    path, design = folder / SHELLS, source.design
+    path, design = folder / records.SHELLS, source.design
     if design is None or not path.exists():
         return
-    found = read_as(dict[str, object], path, mend="Run the campaign into a new folder.").get("pool")
+    found = records.read_as(dict[str, object], path, mend="Run the campaign into a new folder.").get("pool")
     if found != design.pool:
         expected = f"those of pool {design.pool}, which this campaign now has"
         mend = "Restore the surrogate library, or the version of the harness (manifest.json), or use a new folder."

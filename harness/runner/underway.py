@@ -16,15 +16,7 @@ from typing import Any
 import pyarrow as pa
 
 from harness.errors import EXIT_BUDGET_SPENT, EXIT_DONE, EXIT_REFUTED, CampaignError, told_of
-from harness.estimators.answer import (
-    STORED_ESTIMATES,
-    before_event,
-    ended_by,
-    estimate_blocks,
-    expected_for,
-    n_softened,
-    pool_remedy,
-)
+from harness.estimators import answer
 from harness.estimators.one_pass import even
 from harness.estimators.pairs import PairDecision, PairVerdict
 from harness.estimators.stopping import Decision, Rule, Verdict
@@ -40,27 +32,9 @@ from harness.report.plots import where_plot
 from harness.report.summary import RunFolder
 from harness.report.words import run_lines
 from harness.resolved import Resolved
-from harness.runner.kept import (
-    SMALLEST_FAILED_SAMPLE,
-    Run,
-    require_few_failed,
-    require_own_folder,
-    require_same_pool,
-    take_over,
-)
+from harness.runner import kept
 from harness.runner.workers import LocalWorkers, ShardResult, Workers
-from harness.sampling import prepare
-from harness.sampling.paths import (
-    IN_WORDS,
-    N_MILDER,
-    begin,
-    beyond_scope,
-    milder_of,
-    n_left_out,
-    requests_before,
-    stored_baseline,
-    stored_table,
-)
+from harness.sampling import paths, prepare
 from harness.sampling.protocol import ShardRequest
 from harness.sampling.shells import Shells, round_requests
 from harness.shown import ShownInPython
@@ -107,7 +81,7 @@ class RunResult(ShownInPython):
 class Underway:
     """A run with the workers that drive it, and who is told how far it is."""
 
-    run: Run
+    run: kept.Run
     crew: Workers
     progress: Progress
     whom: str = ""
@@ -121,7 +95,7 @@ class Underway:
 
     def keep_design(self) -> None:
         """Write the strata, without which nothing can be estimated, where the folder has no others."""
-        require_same_pool(self.run.folder, self.run.source)
+        kept.require_same_pool(self.run.folder, self.run.source)
         if self.run.source.design is not None:
             write_sealed(self.run.folder / SHELLS, STORED_DESIGN.dump_python(self.run.source.design, mode="json"))
 
@@ -132,22 +106,22 @@ class Underway:
         left_open = assumed(resolved, source.pool, source.design, self.progress)
         self.run = self.run.noting(assumed=left_open, onset_step=resolved.family.first_onset(resolved.environment))
         if resolved.family.milder(resolved.environment) is not None:
-            driven = self._before(MILDER, N_MILDER)
-            self.run = self.run.noting(milder=milder_of(resolved, driven))
-        if (paths := source.baseline_paths) is None:
+            driven = self._before(MILDER, paths.N_MILDER)
+            self.run = self.run.noting(milder=paths.milder_of(resolved, driven))
+        if (baseline := source.baseline_paths) is None:
             return
-        table, runs = begin(source, self._before)
+        table, runs = paths.begin(source, self._before)
         self.crew.follow_from(parquet(table))
-        self.run = self.run.noting(distance_per_test_m=runs.mean_distance_m(paths.weight)).written()
+        self.run = self.run.noting(distance_per_test_m=runs.mean_distance_m(baseline.weight)).written()
         self.keep_design()
 
     def _before(self, name: str, n: int) -> pa.Table:
         """What comes before tests that count, but for what an earlier run has done of it."""
-        what, causes = IN_WORDS[name], Counter[str]()
+        what, causes = paths.IN_WORDS[name], Counter[str]()
         self.progress.stage(f"{what}{self.crew.where}", n)
-        stored = stored_table(self.run.folder, self.run.parts_before, name)
-        known = partial(stored_baseline, stored, self.run.source.baseline_paths)
-        for result in self.crew.run(requests_before(name, n), known):
+        stored = paths.stored_table(self.run.folder, self.run.parts_before, name)
+        known = partial(paths.stored_baseline, stored, self.run.source.baseline_paths)
+        for result in self.crew.run(paths.requests_before(name, n), known):
             with uninterrupted():
                 self.run = self.run.with_baseline(name, result)
             causes += result.failures
@@ -155,7 +129,7 @@ class Underway:
         if name != MILDER:  # one of few that fails is told, as if it had crashed
             campaign, table = self.run.resolved.campaign, f"the run folder's {name}/ table"
             again = f"`harness av-check VEHICLE --scenario {campaign.scenario}` drives it alone"
-            require_few_failed(causes, n, campaign, again, what, table)
+            kept.require_few_failed(causes, n, campaign, again, what, table)
         return pa.concat_tables(self.run.before[name])
 
     def drive_tests(self) -> Rule:
@@ -177,7 +151,7 @@ class Underway:
             for shard in self.crew.run(iter(requests), self.run.known):
                 with uninterrupted():
                     self.run = self.run.with_shard(shard)
-                self.run.require_few_failed(at_least=SMALLEST_FAILED_SAMPLE)
+                self.run.require_few_failed(at_least=kept.SMALLEST_FAILED_SAMPLE)
                 n_new = max(self.run.n_episodes - self.run.earlier.n_episodes, 0)
                 counts = {"crashes": int(shard.block.crash.sum()), "failed": int(shard.block.failed.sum())}
                 told = {name: n for name, n in counts.items() if n or name == "crashes"}
@@ -209,29 +183,29 @@ class Underway:
         for each in run.blocks:
             counts.update(each.acts())
         n_early = sum(each.n_crashes_before_event(run.facts.get("onset_step")) for each in run.blocks)
-        n_milder = n_left_out(campaign, n_early) + beyond_scope(run.facts.get("milder"))
-        n_milder += n_softened(before_event(campaign, run.facts, counts))
+        n_milder = paths.n_left_out(campaign, n_early) + paths.beyond_scope(run.facts.get("milder"))
+        n_milder += answer.n_softened(answer.before_event(campaign, run.facts, counts))
         return n_milder, len(run.repeated.differing) if run.repeated else 0
 
     def finish(self, rule: Rule, *, of_sum: bool = False) -> RunResult:
         """Write manifest, estimates and report; ``of_sum`` the rule, and its decision, is about several scenarios."""
         run, campaign, decided = self.run, self.run.resolved.campaign, dict[str, Any]()
-        stopped_by: StoppedBy = "sum" if of_sum else ended_by(campaign, rule, run.n_episodes)
+        stopped_by: StoppedBy = "sum" if of_sum else answer.ended_by(campaign, rule, run.n_episodes)
         missed = campaign.stop.rhw is not None and stopped_by not in ("rhw", "below_reference", "sum")
         if (decision := None if of_sum else rule.look.decision) is not None:
             decision = doubted(decision, [self])
             decided["decision"] = decision.to_json()
-        decided["expected"] = expected_for(rule, campaign, run.n_episodes) if missed else None
-        decided["remedy"] = pool_remedy(rule, campaign, stopped_by) or None
+        decided["expected"] = answer.expected_for(rule, campaign, run.n_episodes) if missed else None
+        decided["remedy"] = answer.pool_remedy(rule, campaign, stopped_by) or None
         ended = {"stopped_by": stopped_by, "unmet": [asdict(each) for each in rule.look.unmet], **decided}
         ended["wall_time_s"] = run.took_s  # told as it is written
         run = run.written("done", **ended)
         self.progress.stage("writing estimates and report", None)
         manifest = run.content("done", **ended)
-        estimates = estimate_blocks(even(run.blocks), campaign, manifest)
+        estimates = answer.estimate_blocks(even(run.blocks), campaign, manifest)
         write_sealed(run.folder / ESTIMATES, estimates)
         tests, traffic = ShownTests.joined(run.shown, run.folder), run.resolved.environment
-        told = STORED_ESTIMATES.validate_python(estimates)
+        told = answer.STORED_ESTIMATES.validate_python(estimates)
         shown = RunFolder(run.folder, campaign, manifest, told, run.source.design, tests, traffic)
         code = exit_code(decision, missed=missed)
         return RunResult(run.folder, write_page_of(shown), estimates, stopped_by, code, shown)
@@ -253,7 +227,7 @@ def taken(folders: Mapping[Path, Resolved], *, resume: bool) -> Iterator[Places]
     with ExitStack() as held:
         for folder in folders:
             held.enter_context(sole_use(folder))
-        yield {folder: (own, require_own_folder(folder, own, resume=resume)) for folder, own in folders.items()}
+        yield {folder: (own, kept.require_own_folder(folder, own, resume=resume)) for folder, own in folders.items()}
 
 
 @contextmanager
@@ -275,7 +249,7 @@ def begun(places: Places, workers: int | None, progress: Progress) -> Iterator[l
                     began = time.monotonic()
                     remove_unfinished(folder.rglob(".*.part"))
                     source = prepare(resolved, progress)
-                    run = take_over(folder, resolved, source, earlier, began, workers=crew.n_workers)
+                    run = kept.take_over(folder, resolved, source, earlier, began, workers=crew.n_workers)
                     runs.append(Underway(run, crew, progress, whom))
                     runs[-1].drive_before_tests()
             progress.remark = ""
