@@ -17,6 +17,7 @@ import pyarrow.parquet as pq
 
 from harness.campaign.campaign import Campaign
 from harness.campaign.files import load_campaign
+from harness.estimators.answer import STORED_ESTIMATES
 from harness.records.folder import SEAL, read_kept, read_manifest, write_part, write_sealed
 from harness.records.reader import read_campaign
 from harness.report.words import short_answer
@@ -70,7 +71,7 @@ def estimates(folder: Path) -> dict[str, Any]:
 
 def answer(content: dict[str, Any], campaign: Campaign, of: dict[str, Any] | None = None) -> dict[str, Any]:
     """The answer of estimates.json in words, with those of a manifest."""
-    return json.loads(json.dumps(asdict(short_answer(campaign, of or {}, content))))
+    return json.loads(json.dumps(asdict(short_answer(campaign, of or {}, STORED_ESTIMATES.validate_python(content)))))
 
 
 def answer_in(folder: Path) -> dict[str, Any]:

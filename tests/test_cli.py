@@ -19,7 +19,7 @@ from harness.commands.options import run_folder
 from harness.commands.printing import say
 from harness.errors import EXIT_REFUTED, RunFolderError, TooManyFailedError
 from harness.progress import Progress
-from harness.report.words import lines, short_answer
+from harness.report.words import run_lines
 from harness.vehicles.library import OF_TRAFFIC
 from tests.golden.campaigns import BASE, RUNS
 from tests.in_process import one_process, without_page
@@ -61,11 +61,7 @@ def test_run_prints_the_answer_and_where_more_is(folder, capsys):
     command = ["run", *CAMPAIGN, "--out", str(folder), "--workers", "1", "--resume"]
     assert main(command) == 0
     out, content = capsys.readouterr().out.splitlines(), estimates(folder)
-    short = lines(
-        short_answer(golden("shells-refuted"), manifest(folder), content),
-        manifest(folder)["wall_time_s"],
-        folder / "report.html",
-    )
+    short = run_lines(golden("shells-refuted"), manifest(folder), content, folder / "report.html")
     assert (out, len(out)) == (short, 6)
     assert main([*command, "--json"]) == 0
     assert json.loads(capsys.readouterr().out) == content

@@ -328,7 +328,8 @@ def paired_estimate(pairs: Pairs, confidence: float) -> dict[str, Any]:
     """
     level, inside, (own,) = Level.two_sided(confidence), pairs.within(), pairs.each
     design, tallies = own.design, [own.tally(side) for side in (0, 1)]
-    a, b = (SeenShells.of(design, tally).result(confidence).shown for tally in tallies)
+    alone = design.without_references()  # counts by stratum say nothing about them
+    a, b = (SeenShells.of(alone, tally).result(confidence).shown for tally in tallies)
     counts = "n_both", "n_only_a", "n_only_b", "n_neither"
     shells = [
         {

@@ -128,10 +128,10 @@ class SeenShells:
         self._crashed: dict[int, list[int]] = {}  # stratum → its first few tests that crashed
 
     @classmethod
-    def of(cls, design: ShellDesign, tally: Tally) -> SeenShells:
-        """From counts by stratum, which say nothing about reference drivers."""
+    def of(cls, design: ShellDesign, cells: Tally) -> SeenShells:
+        """From counts by cell of the design."""
         shells = cls()
-        shells.count(design.without_references(), tally)
+        shells.count(design, cells)
         return shells
 
     @classmethod

@@ -66,11 +66,8 @@ class ShortAnswer:
     scope: str
 
 
-def short_answer(
-    campaign: Campaign, manifest: Mapping[str, Any], content: Estimates | Mapping[str, Any]
-) -> ShortAnswer:
-    """The answer of ``estimates.json``, with what the ``manifest`` of the run says besides."""
-    told = STORED_ESTIMATES.validate_python(content)
+def short_answer(campaign: Campaign, manifest: Mapping[str, Any], told: Estimates) -> ShortAnswer:
+    """The answer of a run's estimates, with what its ``manifest`` says besides."""
     vehicle, parameters = vehicle_words(campaign.av, script=manifest.get("script"))
     return ShortAnswer(
         vehicle=vehicle,

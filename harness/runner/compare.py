@@ -128,14 +128,10 @@ def compare_campaigns(
       90 % intervals cover sampling error in this simulated traffic only; stopped: verdict reached
       report  runs/late/report.html
     """
-    a, b, out = campaign_of(a), campaign_of(b), Path(out)
+    a, b, out, stored = campaign_of(a), campaign_of(b), Path(out), None if stored is None else Path(stored)
     folders = {name: name for name in a.scenarios} if a.scenarios else {a.scenario: ""}
     if stored is not None:
-        stored = Path(stored)
-        if out.resolve().is_relative_to(stored.resolve()):
-            expected = "a folder outside of that of A's run, which is copied into it"
-            raise RunFolderError("--out", str(out), expected, "Choose another folder with --out.")
-        _require_stored(stored, [*folders.values()], a)
+        _require_stored(stored, [*folders.values()], a, out)
     if margin is not None and rhw is not None:
         expected = "one end of the comparison"
         raise CampaignError("--margin", f"stop.rhw={rhw:g} beside it", expected, "Leave out --margin or stop.rhw.")
@@ -146,14 +142,7 @@ def compare_campaigns(
         raise CampaignError("stop.each_family", "true", expected, "Write --set stop.each_family=false.")
     if out.is_dir():
         require_no_other(out, [*(a.scenarios or SIDES), COMPARISON])
-    ready: dict[Path, Both] = {}
-    for name, folder in folders.items():
-        each_ready = []
-        for side, whole in zip("AB", (a, b), strict=True):
-            with told_of(f"{side}, {name}" if a.scenarios else side):
-                each_ready.append(require_ready(whole.of_family(name) if whole.scenarios else whole, "compare"))
-        require_comparable(*(each.campaign for each in each_ready))
-        ready[out / folder] = _with_same_shells(*each_ready, a_is_stored=stored is not None)
+    ready = {out / folder: _ready(a, b, name, a_is_stored=stored is not None) for name, folder in folders.items()}
     if stored is not None:
         for folder in folders.values():
             copy_stored(stored / folder, out / folder / "a", ready[out / folder][0])
@@ -178,14 +167,27 @@ def compare_campaigns(
     return _sum_written(out, a, pairs, scenarios, ended, each, told[0], code)
 
 
-def _require_stored(stored: Path, folders: Sequence[str], campaign: Campaign) -> None:
-    """Refuse a run of A whose code may be a stranger's, or whose campaign is damaged."""
+def _require_stored(stored: Path, folders: Sequence[str], campaign: Campaign, out: Path) -> None:
+    """Refuse a run of A that ``out`` lies in, whose code may be a stranger's, or whose campaign is damaged."""
+    if out.resolve().is_relative_to(stored.resolve()):
+        expected = "a folder outside of that of A's run, which is copied into it"
+        raise RunFolderError("--out", str(out), expected, "Choose another folder with --out.")
     for folder in folders:
         mend = f"Read that code; then name {stored / CAMPAIGN} for A, which drives it anew."
         require_trust(stored / folder, read_manifest(stored / folder), code_of(campaign.av), mend)
     if (stored / FAMILIES).is_file():  # that of one scenario is known by its hash
         known = read_families(stored).get("campaign_crc32")
         require_sum(stored / CAMPAIGN, known, (stored / CAMPAIGN).read_bytes(), MEND)
+
+
+def _ready(a: Campaign, b: Campaign, scenario: str, *, a_is_stored: bool) -> Both:
+    """Both in one of their scenarios, refused where they cannot be run, or not be compared."""
+    ready = []
+    for side, whole in zip("AB", (a, b), strict=True):
+        with told_of(f"{side}, {scenario}" if a.scenarios else side):
+            ready.append(require_ready(whole.of_family(scenario) if whole.scenarios else whole, "compare"))
+    require_comparable(*(each.campaign for each in ready))
+    return _with_same_shells(*ready, a_is_stored=a_is_stored)
 
 
 def _written(
@@ -240,7 +242,7 @@ def _sum_written(
 
 def _decided(rule: PairRule, scenarios: Sequence[PairedScenario]) -> PairDecision:
     """What a rule has found, after what was seen besides in these scenarios."""
-    doubts = (zip(*(of.runs[side].doubted() for of in scenarios), strict=True) for side in (0, 1))
+    doubts = (zip(*(of.runs[side].doubtful() for of in scenarios), strict=True) for side in (0, 1))
     of_a, of_b = (tuple(map(sum, each)) for each in doubts)
     return rule.decision.doubted(of_a[0], of_b[0], of_a[1] + of_b[1])
 

@@ -152,6 +152,7 @@ def run_families(campaign: Campaign, out: Path, *, workers: int | None, resume: 
 def _run(
     campaign: Campaign, places: Places, rule: RoundRule, workers: int | None, progress: Progress
 ) -> tuple[PerHour, dict[str, RunResult], Decision | None]:
+    """Drive rounds over all scenarios until the rule has enough: their sum, the result of each, and what is decided."""
     with begun(places, workers, progress) as each_run:
         runs = dict(zip(campaign.scenarios or [], each_run, strict=True))
         seen = {name: SeenShells(underway.prescribed.design) for name, underway in runs.items()}
@@ -184,7 +185,10 @@ def hour_answer(
     *,
     counts: bool = False,
 ) -> dict[str, Any]:
-    """The sum, with what estimates and manifest of each have ``told``; hours are kilometres as followers drive."""
+    """The sum as ``families.json`` has it, and of each scenario what its estimates and manifest have ``told``.
+
+    Crashes per km are those per hour at the mean speed of scenarios in which the AV follows.
+    """
     follow = [each for each in ready.values() if each.family.follows] or list(ready.values())
     speeds = [each.family.mean_speed_mps(each.environment) for each in follow]
     left_open = {name: Assumed(**of) for name, (_, manifest) in told.items() if (of := manifest.get("assumed"))}

@@ -177,8 +177,8 @@ class Underway:
             self.run.require_few_failed()
             self.run.require_no_fewer()
 
-    def doubted(self) -> tuple[int, int]:
-        """What keeps a limit from being accepted, by number of tests: see `Decision`."""
+    def doubtful(self) -> tuple[int, int]:
+        """Numbers of tests that keep a limit from being accepted: ``n_milder`` and ``n_differing`` of a `Decision`."""
         run, campaign, counts = self.run, self.run.resolved.campaign, Counter[str]()
         for each in run.blocks:
             counts.update(each.acts())
@@ -212,8 +212,8 @@ class Underway:
 
 
 def doubted(decision: Decision, runs: Iterable[Underway]) -> Decision:
-    """What was decided of these runs together, after what was seen besides."""
-    n_milder, n_differing = map(sum, zip(*(each.doubted() for each in runs), strict=True))
+    """The decision about these runs together, with what keeps it from being accepted."""
+    n_milder, n_differing = map(sum, zip(*(each.doubtful() for each in runs), strict=True))
     return replace(decision, n_milder=n_milder, n_differing=n_differing)
 
 

@@ -34,9 +34,7 @@ def family(name, p, tests, crashes, exposure, reference=(), p_event=1.0):
     )  # fmt: skip
     counts = [np.array(each, np.int64) for each in (tests, crashes, np.zeros(n))]
     mass = np.diag(counts[1] * p)  # every path has the same probabilities
-    seen = SeenShells()
-    seen.count(design, Tally(*counts, mass, np.zeros((n, n))))
-    return OfFamily(name, exposure, seen)
+    return OfFamily(name, exposure, SeenShells.of(design, Tally(*counts, mass, np.zeros((n, n)))))
 
 
 CC = (Reference("r157-cc", "a driver"),)
@@ -78,9 +76,7 @@ def test_baseline_runs_for_a_verdict_are_those_of_the_scenarios_that_repeat_them
 
 
 def replace_design(of, **changes):
-    seen = SeenShells()
-    seen.count(replace(of.seen.design, **changes), of.tally)
-    return of._replace(seen=seen)
+    return of._replace(seen=SeenShells.of(replace(of.seen.design, **changes), of.tally))
 
 
 def test_of_a_vehicle_that_provokes_events_an_hour_counts_those_ahead_of_others():
@@ -105,9 +101,7 @@ def test_another_reading_of_the_competent_driver_has_a_ratio_of_its_own():
         lead.seen.design, references=names, reference_rate=np.array(rates), reference_square=np.array(rates) ** 2,
         cell_references=(7, 6, 4),
     )  # fmt: skip
-    seen = SeenShells()
-    seen.count(design, lead.tally)
-    hour = PerHour([THREE[0], lead._replace(seen=seen), THREE[2]])
+    hour = PerHour([THREE[0], lead._replace(seen=SeenShells.of(design, lead.tally)), THREE[2]])
     told = hour.to_json(0.9, 32.0)
     (letter,) = told["readings"]
     reference = math.fsum(of.reference_rate for of in THREE) + 0.1 * (rates[1] - rates[0])

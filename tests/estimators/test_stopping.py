@@ -141,8 +141,7 @@ def test_a_run_that_a_reference_driver_ends_is_held_to_the_level_of_decisions(n)
     content, stopped = {"name": "x", "testing": {"method": "shells"}}, []
     for rate in np.geomspace(1e-7, 1e-2, 40):
         design = replace(DESIGN, **known, reference_rate=np.array([rate]))
-        counted = SeenShells()
-        counted.count(design, Tally(tests, crashes, 0 * tests, np.outer(crashes, P), np.zeros((3, 3))))
+        counted = SeenShells.of(design, Tally(tests, crashes, 0 * tests, np.outer(crashes, P), np.zeros((3, 3))))
         asked = {"stop": {"rhw": 1e-3, "below_reference": 0.2}}
         gate = {"accept": {"times_reference": {"driver": "r157-cc", "at_most": 0.2}}}
         below, accepting = (RoundRule(Campaign.model_validate({**content, **each})) for each in (asked, gate))
@@ -224,9 +223,9 @@ def test_tests_that_are_missing_are_those_that_would_do():
 def test_a_limits_threshold_follows_from_the_crashes_that_it_makes_expected(tests, statement, driver, expected):
     """Ten times the tests where ten times as much lies outside: cut-ins that take time are no rarer decided."""
     known = {"reference_rate": np.array([2e-8]), "reference_square": np.array([1e-15])}
-    design, counted = replace(DESIGN, references=(Reference("r157-cc", "a driver"),), **known), SeenShells()
+    design = replace(DESIGN, references=(Reference("r157-cc", "a driver"),), **known)
     none, of_pairs = np.zeros(3, np.int64), np.zeros((3, 3))
-    counted.count(design, Tally(np.array(tests), none, none, of_pairs, of_pairs))
+    counted = SeenShells.of(design, Tally(np.array(tests), none, none, of_pairs, of_pairs))
     assert counted.expected(1e-7, driver, statement) == pytest.approx(expected)
 
 

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import pytest
 
-from harness.estimators.answer import AssumedOfRate, estimate_blocks
+from harness.estimators.answer import STORED_ESTIMATES, AssumedOfRate, estimate_blocks
 from harness.estimators.stopping import Decision
 from harness.numbers import number, plain
 from harness.records.folder import read_manifest
@@ -62,7 +62,8 @@ def test_without_a_crash_there_is_a_bound_and_nothing_about_impacts(stored_run):
     """Of the same tests had none crashed: above 50 m/s none did."""
     folder, campaign = stored_run("shells-twin"), golden("shells-twin", "crash.counts_above_mps=50")
     blocks, known = [block.harder_than(50.0) for block in stored_blocks(folder, moments=False)], read_manifest(folder)
-    rows = {row.key: row for row in short_answer(campaign, known, estimate_blocks(blocks, campaign, known)).rows}
+    told = STORED_ESTIMATES.validate_python(estimate_blocks(blocks, campaign, known))
+    rows = {row.key: row for row in short_answer(campaign, known, told).rows}
     assert set(rows) == {"rate", "ratio"}
     assert (rows["rate"].what, rows["rate"].interval) == ("crash rate > 50 m/s", "no crash seen")
     assert rows["rate"].value.startswith("< ")
