@@ -137,8 +137,3 @@ def _words(task: Task) -> str:
     rate = f"{count(1.0 / s_each)}/s" if s_each < 1.0 else f"{duration(s_each)} each"
     missing = 0.0 if task.total is None else task.total - task.completed
     return " · ".join([rate, *figures, *([f"{duration(missing * s_each)} left"] if missing > 0.0 else [])])
-
-
-def shown_progress(*, quiet: bool = False) -> Progress:
-    """Give a bar when stderr is a terminal, else lines: a log file is no place for a bar. Nothing at all if quiet."""
-    return Progress() if quiet else ShownProgress()

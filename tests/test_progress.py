@@ -7,10 +7,12 @@ import math
 import re
 import threading
 
+import click
 import pytest
 
 from harness import numbers as n
-from harness.progress import Progress, ShownProgress, shown_progress
+from harness.commands.options import progress_bar
+from harness.progress import Progress, ShownProgress
 
 
 class Log(io.StringIO):
@@ -27,8 +29,10 @@ class Log(io.StringIO):
 def test_a_log_gets_a_line_now_and_then_and_none_of_what_is_quickly_done(monkeypatch):
     log = Log()
     monkeypatch.setattr("sys.stderr", log)
-    assert type(shown_progress(quiet=True)) is Progress
-    assert isinstance(shown_progress(), ShownProgress)
+    for quiet, kind in ((True, Progress), (False, ShownProgress)):
+        with click.Context(click.Command("run")) as context:
+            context.meta["quiet"] = quiet
+            assert type(progress_bar()) is kind
     with ShownProgress(interval_s=1e-3) as lines:
         lines.stage("episodes", total=13_187)
         lines.advance(5_000, crashes=5)

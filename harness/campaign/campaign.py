@@ -18,6 +18,7 @@ from harness.campaign.sections import (
     DEFAULT,
     DEFAULT_FAMILY,
     LEAST_TESTS,
+    MIN_CRASHES,
     Accept,
     CrashSettings,
     EnvironmentSettings,
@@ -127,7 +128,7 @@ class Campaign(Section):
         """Sampled crashes needed before RHW may stop the campaign; limits within shells are exact, without a floor."""
         if self.stop.min_crashes is not None:
             return self.stop.min_crashes
-        return 1 if self.sampling.strata else 100
+        return 1 if self.sampling.strata else MIN_CRASHES
 
     @property
     def own_surrogates(self) -> dict[str, str]:

@@ -227,6 +227,10 @@ class Records(Section):
     trace_share: Probability = Field(0.0, description="share of tests traced whatever their outcome")
 
 
+MIN_CRASHES = 100
+"""Sampled crashes before a precision may end tests that have weights."""
+
+
 class Stop(Section):
     """When the campaign is long enough."""
 

@@ -117,9 +117,9 @@ def of_scenario(text: str | None) -> list[str]:
 
 def progress_bar() -> Progress:
     """What a command shows of its work, unless it is to be quiet."""
-    from harness.progress import shown_progress
+    from harness.progress import Progress, ShownProgress
 
-    return shown_progress(quiet=click.get_current_context().meta.get("quiet", False))
+    return Progress() if click.get_current_context().meta.get("quiet") else ShownProgress()
 
 
 junit_option = click.option(

@@ -21,7 +21,7 @@ from dataclasses import asdict, dataclass, replace
 from typing import Any, Literal
 
 from harness.campaign.campaign import Campaign
-from harness.campaign.sections import Accept, Stop
+from harness.campaign.sections import MIN_CRASHES, Accept, Stop
 from harness.estimators.estimate import Estimate, Note, finite_json, note
 from harness.estimators.likelihood import Level
 from harness.estimators.limits import clopper_pearson
@@ -35,7 +35,6 @@ LOOK_RATIO = 1.1
 """Of neighbouring looks: since the half-width shrinks with 1/√n, they differ by 5 % in precision, which is the noise of
 the half-width itself at the default floor of 100 crashes (half of 1/√100); a finer grid mostly repeats the same look.
 With two passes a campaign uses about 20 % more tests than a fixed size would need, at a ratio of 1.25 nearly 50 %."""
-DEFAULT_MIN_CRASHES = 100
 POOL_SHARE = 0.5
 """Share of the squared width from the pool's own error above which more tests hardly narrow an interval."""
 NARROW = 0.1
@@ -205,7 +204,7 @@ class StopRule(Rule):
     _needed = 2
 
     def __init__(self, campaign_stop: Stop, shard_ends: Sequence[int], ratio: float = LOOK_RATIO) -> None:
-        super().__init__(campaign_stop.rhw, campaign_stop.min_crashes or DEFAULT_MIN_CRASHES)
+        super().__init__(campaign_stop.rhw, campaign_stop.min_crashes or MIN_CRASHES)
         self.looks = look_grid(campaign_stop.episodes, shard_ends, ratio)
         self._n_looks = 0
 

@@ -296,5 +296,4 @@ def bar_of(move: Move, results: Sequence[Nearby | None]) -> Bar:
         nearest = [int(np.argmin(np.abs(known[:, 0] - end))) for end in ends[:, 0]] if enough else []
         off = off[told][nearest] if enough else nowhere[0]
     rate, ratio, most_off = ((float(low), float(high)) for low, high in (*ends.T, off))
-    told_by = {"n": len(results), "no_laws": no_laws, "unlike": unlike}
-    return Bar(move.what, move.known, move.values, rate, ratio, most_off, **told_by)
+    return Bar(move.what, move.known, move.values, rate, ratio, most_off, len(results), no_laws, unlike)
