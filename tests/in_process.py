@@ -27,8 +27,8 @@ from harness.sampling.protocol import ShardRequest
 def without_page() -> Iterator[None]:
     """It takes longer than small campaigns; test_api.py looks at it."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("harness.report.page.write_page_of", lambda run: run.path / "report.html")
-        patch.setattr("harness.report.page.write_comparison", lambda folder, *_: folder / "report.html")
+        patch.setattr("harness.runner.underway.write_page_of", lambda run: run.path / "report.html")
+        patch.setattr("harness.runner.compare.write_comparison", lambda folder, *_: folder / "report.html")
         yield
 
 

@@ -182,7 +182,7 @@ def test_a_margin_is_decided(campaigns, done, tmp_path, swapped, verdict, exit_c
 )
 def test_no_margin_is_kept_by_a_vehicle_in_doubt(margin, of_a, of_b, verdict):
     """Doubts are crashes that a rate leaves out, and tests that were not the same when they ran twice."""
-    sides = [SimpleNamespace(doubted=lambda doubts=doubts: doubts) for doubts in (of_a, of_b)]
+    sides = [SimpleNamespace(doubtful=lambda doubts=doubts: doubts) for doubts in (of_a, of_b)]
     rule = SimpleNamespace(decision=PairDecision(margin, "proven", 0.95, given_the_library=False))
     found = _decided(rule, [SimpleNamespace(runs=sides)])
     assert found.verdict == verdict
