@@ -27,10 +27,7 @@ from harness.vocabulary import FAMILIES, MOST_ASKED
     ),
 )
 @click.argument("campaign_file", metavar="CAMPAIGN|VEHICLE", type=CAMPAIGN)
-@options.av_option
-@options.scenario_option
-@options.set_option
-@options.json_option
+@options.campaign_options
 def check(
     campaign_file: Path, *, overrides: Sequence[str], av: str | None, scenario: str | None, as_json: bool
 ) -> None:
@@ -73,7 +70,6 @@ def check(
 )
 @click.argument("campaign_file", metavar="CAMPAIGN|VEHICLE", type=CAMPAIGN)
 @click.option("--out", "folder", type=FOLDER, help="Run folder; made if it is not there. Default: a new one in runs/.")
-@options.scenario_option
 @options.workers_option
 @options.executor_option
 @click.option("--resume", is_flag=True, help="Go on with what the run folder already holds.")
@@ -88,9 +84,7 @@ def check(
 )  # fmt: skip
 @options.exposure_option
 @options.junit_option
-@options.av_option
-@options.set_option
-@options.json_option
+@options.campaign_options
 @click.pass_context
 def run(
     ctx: click.Context,
@@ -174,10 +168,7 @@ def run(
 )  # fmt: skip
 @options.workers_option
 @options.junit_option
-@options.av_option
-@options.scenario_option
-@options.set_option
-@options.json_option
+@options.campaign_options
 @click.pass_context
 def compare(
     ctx: click.Context,
@@ -262,10 +253,7 @@ def compare(
 @click.option(
     "--tests", "episodes", type=click.IntRange(2, MOST_ASKED), default=48, show_default=True, help="Tests to run."
 )
-@options.scenario_option
-@options.av_option
-@options.set_option
-@options.json_option
+@options.campaign_options
 @click.pass_context
 def av_check(
     ctx: click.Context,

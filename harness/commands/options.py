@@ -129,6 +129,13 @@ junit_option = click.option(
 json_option = click.option("--json", "as_json", is_flag=True, help="Print JSON on stdout instead of text.")
 
 
+def campaign_options(command: Callable[..., None]) -> Callable[..., None]:
+    """Options of a command that takes a campaign or a vehicle: what is changed of it, and how the answer is printed."""
+    for option in (json_option, set_option, av_option, scenario_option):
+        command = option(command)
+    return command
+
+
 def examples(*lines: str) -> str:
     """Lay out lines below a help text, kept as they are (the backspace is click's mark for that)."""
     return "\b\nExamples:\n" + "\n".join(f"  {line}" for line in lines)
