@@ -221,11 +221,14 @@ def compare(
         b = harness.load_campaign(of_b, [*overrides, *against], av=av)
     if stored is not None:  # how far it was run before says nothing about now
         a = a.model_copy(update={"stop": b.stop})
-    vehicles = vehicle_words(a.av)[0], vehicle_words(b.av)[0]
+    (vehicle_a, _), (vehicle_b, _) = vehicle_words(a.av), vehicle_words(b.av)
     name_b = ", ".join(against) if file_b is None else b.name
-    labels = (a.name, b.name) if a.name != b.name else (str(source_a), str(file_b))
-    if vehicles[0] != vehicles[1] or file_b is None:
-        labels = vehicles if vehicles[0] != vehicles[1] else (vehicles[0], f"{vehicles[0]}, {name_b}")
+    if vehicle_a != vehicle_b:
+        labels = vehicle_a, vehicle_b
+    elif file_b is None:
+        labels = vehicle_a, f"{vehicle_a}, {name_b}"
+    else:
+        labels = (a.name, b.name) if a.name != b.name else (str(source_a), str(file_b))
     if junit is not None and margin is None:
         say("note: without --margin the JUnit file says only whether it came to an end, whichever is worse", err=True)
     if folder is None:
