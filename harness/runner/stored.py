@@ -9,6 +9,7 @@ from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
+import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 from pydantic import Field
@@ -333,12 +334,14 @@ def estimate_families(
     for name, of in ((name, folder / name) for name in names):
         manifest, seen = read_manifest(of), SeenShells.of_blocks(stored_blocks(of, moments=False))
         resolved = ready[name] = resolve(read_campaign(of, manifest))
+        require_campaign(of / CAMPAIGN, resolved.content_hash, manifest)  # exposures are those of its file
         families.append(OfFamily(name, exposure_of(resolved, given), seen))
         told[name] = read_as(Estimates, of / ESTIMATES, mend=MEND), manifest
     answer = hour_answer(PerHour(families), ready, told, confidence or stored["confidence"], counts=counts)
     ran = stored.pop("ran", None) or {name: stored[name] for name in ("exposure", "decision")}
     was = [exposure_of(of, ran["exposure"]).per_hour for of in ready.values()]
-    moved = was != [of.exposure.per_hour for of in families]  # a verdict is of those of its run
+    now = [of.exposure.per_hour for of in families]
+    moved = not np.allclose(was, now, rtol=1e-9, atol=0.0)  # a verdict is of those of its run
     stored |= {"decision": None, "ran": ran} if moved else {"decision": ran["decision"]}
     return StoredEstimates(finite_json({**stored, "exposure": given, **answer}), folder)
 

@@ -167,7 +167,8 @@ def test_a_verdict_is_of_the_exposures_that_it_was_reached_with(tmp_path):
     stored = json.loads((run.folder / "families.json").read_text())
     shipped = run.content["families"]["lead_brakes"]["exposure"]["per_hour"]
     assert stored["decision"] is None
-    assert estimate_families(run.folder, {"lead_brakes": shipped})["decision"] == verdict
+    for same in (shipped, 0.1):  # as it is shown: the share in scope is 1 but for the last bits
+        assert estimate_families(run.folder, {"lead_brakes": same})["decision"] == verdict
 
 
 @pytest.mark.parametrize("wrong", ["1e300", "1e-320", "nan", "x", 0.0, 1e300, True])
@@ -348,6 +349,9 @@ def test_each_scenario_may_have_a_file_of_its_own(tmp_path):
     told = hour_lines(run_here(one, tmp_path / "run").content)
     assert " in SUMO’s twin, 1 scenario · " in told[0]
     assert "  events per hour of driving, given: lead brakes 0.3; other assumed" in "\n".join(told)
+    (tmp_path / "mine.yaml").write_text("like: lead-brakes-1\nexposure: {per_hour: {value: 0.5, source: user}}\n")
+    with pytest.raises(RunFolderError, match="which made the records"):  # the tests are of the file as it was
+        estimate_families(tmp_path / "run")
     with pytest.raises(CampaignError, match="no file"):
         campaign("environments={lead_brakes: ./none.yaml}")
     with pytest.raises(CampaignError, match="cut-out-1"):
