@@ -109,12 +109,11 @@ def sum_warnings(content: Mapping[str, Any]) -> Iterator[str]:
     """What changes the meaning of the rows, a line each, by scenario."""
     decision, ends = content.get("decision"), content["beside"]["over_assumed"]
     if decision and (verdict := decision["verdict"]) != "undecided":
-        limit, over = decision["limit"], decision.get("over_assumed")
-        turned = over is not None and (end(over[1]) >= limit if verdict == "accepted" else over[0] <= limit)
-        if turned or (ends is not None and decision["driver"] and ends[0] <= limit <= ends[1]):
+        over = [each for each in (decision.get("over_assumed"), decision["driver"] and ends) if each]
+        low, high = min((each[0] for each in over), default=math.inf), max((end(each[1]) for each in over), default=0.0)
+        if over and (high >= decision["limit"] if verdict == "accepted" else low <= decision["limit"]):
             sign, as_text = ("× ", ratio) if decision["driver"] else ("", number)
-            low, high = over if turned else ends
-            most = "no limit" if high is None else as_text(high)
+            most = "no limit" if math.isinf(high) else as_text(high)
             yield f"assumed numbers may turn this verdict: {sign}{as_text(low)} to {most} over their ranges"
     yield from words.runs_warning(decision)
     for each in content["readings"]:

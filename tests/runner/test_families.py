@@ -14,6 +14,7 @@ from harness.estimators.stopping import Decision
 from harness.estimators.traffic import Bar, Sensitivity
 from harness.families.words import EXCLUDED
 from harness.numbers import number
+from harness.numbers import ratio as shown_ratio
 from harness.pool import moved
 from harness.printed import PRINTED
 from harness.progress import Progress
@@ -293,6 +294,9 @@ def test_a_verdict_that_assumed_numbers_may_turn_says_so(run, times, warned):
     accepted = {**verdict, "limit": 2.0 * high, "verdict": "accepted", "over_assumed": [low, times * 1.9 * high]}
     told = " ".join(" ".join(hour_lines({**run.content, "decision": accepted})).split())  # by limits, not by the rate
     assert told.count("! assumed numbers may turn this verdict: × ") == warned
+    wider = {**verdict, "limit": 2.0 * ratio, "over_assumed": [ratio, 2.0 * high]}  # of exposures alone
+    told = " ".join(" ".join(hour_lines({**run.content, "decision": wider})).split())
+    assert f"turn this verdict: × {shown_ratio(low)} to {shown_ratio(2.0 * high)} over" in told
     own = {**run.content, "decision": {**verdict, "verdict": "undecided"}}
     assert "may turn" not in " ".join(hour_lines(own))
 
