@@ -199,6 +199,9 @@ def _of_one(
 def _of_sum(folder: Path, ranges: Mapping[str, tuple[float, float]], progress: Progress) -> Sensitivity:
     """Bars of each scenario, by its share of the sum's rates, and of the exposures; one that refuses is left out."""
     stored, bars, of_numbers = read_families(folder), list[Bar](), dict[str, Mapping[str, tuple[float, float]]]()
+    if not stored["n_crashes"]:  # a limit of several scenarios is no sum of their own, of which each has a share
+        mend = f"Ask {folder / next(iter(stored['families']))}, say, or harness estimate with --exposure."
+        raise CampaignError(_OPTION, "tests of which none crashed", "crashes, whose rate moves", mend)
     for name in stored["families"]:
         campaign = read_campaign(folder / name, read_manifest(folder / name), check_files=True)
         of_file = {each.replace("__", ".") for each in resolve(campaign).parameters.numbers()}

@@ -284,6 +284,26 @@ def test_what_moves_one_scenario_moves_the_sum_by_its_share(run, tmp_path, monke
     assert "found:    braking.stop_shar" in capsys.readouterr().err
 
 
+def test_a_limit_of_the_sum_has_no_bars(run, tmp_path):
+    """Where none crashed a share of the rate is of nothing, and all bars would be 1."""
+    folder = copy_of(run.folder, tmp_path / "run")
+    write_sealed(folder / "families.json", {**run.content, "n_crashes": 0})
+    with pytest.raises(CampaignError, match="tests of which none crashed"):
+        harness.sensitivity(folder)
+
+
+def test_a_rate_beside_its_count_is_that_of_it(tmp_path):
+    for events, right in ((30, True), (3, False)):
+        counted = f"{{per_hour: {{value: 0.3, source: user}}, events: {events}, hours: 100.5}}"
+        (tmp_path / "mine.yaml").write_text(f"like: lead-brakes-1\nexposure: {counted}\n")
+        asked = campaign(f"environments={{lead_brakes: {tmp_path / 'mine.yaml'}}}").of_family("lead_brakes")
+        if right:
+            assert resolve(asked).parameters.exposure.events == events
+        else:
+            with pytest.raises(CampaignError, match=r"0\.3, beside events 3 in hours 100\.5"):
+                resolve(asked)
+
+
 @pytest.mark.parametrize(("times", "warned"), [(0.9, 0), (1.1, 1)])
 def test_a_verdict_that_assumed_numbers_may_turn_says_so(run, times, warned):
     ratio, (low, high) = run.content["beside"]["ratio"], run.content["beside"]["over_assumed"]

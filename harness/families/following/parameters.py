@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import Annotated, ClassVar, Self
 
@@ -28,6 +29,8 @@ from harness.vocabulary import FloatArray, RecordArray
 
 ROAD_S = 55.0
 """Longest test: the road is 4 km long, and vehicles drive 40 m/s and more."""
+ROUNDED = 0.02
+"""By how much a rate may differ from events over hours."""
 EVENT_DTYPE = np.dtype(
     [
         ("peak_mps2", np.float64),  # how hard the vehicle ahead brakes
@@ -82,6 +85,17 @@ class Counted(Section):
     per_hour: Annotated[Number, within(*EXPOSURES)]
     events: Annotated[int, Field(ge=1)] | None = None
     hours: Annotated[float, Field(gt=0.0)] | None = None
+
+    @model_validator(mode="after")
+    def _rate_is_that_of_the_count(self) -> Self:
+        if self.events is None and self.hours is None:
+            return self
+        rate = (self.events or 0) / (self.hours or math.inf)
+        if not math.isclose(rate, self.per_hour.value, rel_tol=ROUNDED):
+            found = f"{self.per_hour.value:g}, beside events {self.events} in hours {self.hours}"
+            mend = "Correct it, or leave out both if none were counted."
+            raise broken_rule("per_hour", found, "events / hours", mend)
+        return self
 
 
 class FollowingParameters(ParameterFile):
