@@ -221,8 +221,8 @@ def _of_sum(folder: Path, ranges: Mapping[str, tuple[float, float]], progress: P
         try:
             found = _of_one(folder / name, of_numbers[name], progress, per_event=True)
         except CampaignError as refused:
-            why = f"found {refused.found}; expected {refused.expected}"
-            sys.stderr.write(f"note: of {name} only the exposure has a bar: {why}\n")
+            why = f"found: {refused.found}; needed: {refused.expected}"
+            sys.stderr.write(f"note: of the numbers of {name} only the exposure was moved ({why})\n")
         else:
             told = [bar.what if bar.what.startswith(f"{name}.") else f"{name} {bar.what}" for bar in found.bars]
             bars += [_part(replace(bar, what=what), *shares) for bar, what in zip(found.bars, told, strict=True)]

@@ -258,7 +258,10 @@ def test_what_moves_one_scenario_moves_the_sum_by_its_share(run, tmp_path, monke
 
     monkeypatch.setattr("harness.runner.other_traffic._of_one", of_one)
     assert main(["sensitivity", str(folder), "--range", "braking.stop_share=0:0.1"]) == 0
-    assert "note: of cut_out only the exposure has a bar: found no number; expected one" in capsys.readouterr().err
+    assert (
+        "of the numbers of cut_out only the exposure was moved (found: no number; needed: one)"
+        in capsys.readouterr().err
+    )
     bars = {bar["what"]: bar for bar in json.loads((folder / "sensitivity.json").read_text())["bars"]}
     assert len(bars) == 3 + 2
     for name, of in told["families"].items():
