@@ -185,6 +185,9 @@ class Family(Protocol):
     """Events of a path between two that a pool asks."""
     pool_error: float = 0.01
     """Relative standard error of its surrogates' crash rates where nothing is said."""
+    outside_kept: int = 1
+    """Of shells outside the boundary a pool keeps so many times as many events: a vehicle that never crashes is known
+    by them."""
     fitter: str = ""
     """Its fit to trajectories (`harness.fitting.protocol.Fitter`), ``module:class``; empty without one."""
     sources: Mapping[Method, str] = MappingProxyType({})

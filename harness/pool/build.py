@@ -11,7 +11,6 @@ from pathlib import Path
 import numpy as np
 
 from harness import cache
-from harness.campaign.sections import PoolSettings
 from harness.compiled import WORLD_SOURCES, source_hash
 from harness.families.protocol import Paths
 from harness.pool.aim import PILOT_PATHS, EnumeratedPaths, Enumerator
@@ -168,7 +167,9 @@ def pool_of(resolved: Resolved, paths: EnumeratedPaths, key: str, order: IntArra
     shell, references = shells_of(paths.crashes, order), paths.crashes >> n_surrogates
     cell, cell_shell, cell_references, by_path = cells_of(mass, shell, references, n_references)
     by_reference = by_path @ ((cell_references[:, None] >> np.arange(n_references)) & 1)
-    path, step = _keep(mass, shell, n_surrogates + 1, settings)
+    n_within = list(names[order]).index(library.boundary) + 1
+    times = np.where(np.arange(n_surrogates + 1) < n_within, 1, family.outside_kept)
+    path, step = _keep(mass, shell, (settings.events_per_shell * times).tolist(), settings.seed)
     chosen = family.choose(environment, settings.seed ^ POOL_SEED, Paths(paths.index[path], paths.start[path]), step)
     asked = np.concatenate([order, n_surrogates + np.arange(n_references)])
     crashes = ((paths.crashes[path, step][:, None] >> asked[None, :]) & 1).astype(np.bool_)
@@ -194,19 +195,19 @@ def pool_of(resolved: Resolved, paths: EnumeratedPaths, key: str, order: IntArra
     )
 
 
-def _keep(mass: FloatArray, shell: Int8Array, n_shells: int, settings: PoolSettings) -> tuple[IntArray, IntArray]:
-    """Systematic sample of events of every shell, with probability proportional to mass.
+def _keep(mass: FloatArray, shell: Int8Array, n_kept: Sequence[int], seed: int) -> tuple[IntArray, IntArray]:
+    """Systematic sample of so many events of every shell, with probability proportional to mass.
 
     Path and step (row and column in ``mass``), each (n,), sorted by shell and path.
     """
     kept = []
-    for s in range(n_shells):
+    for s, n in enumerate(n_kept):
         places = np.flatnonzero((shell == s) & (mass > 0.0))
         if places.size == 0:
             continue
         cumulative = np.cumsum(mass.ravel()[places])
-        offset = uniforms(settings.seed, s, 1, DIAGNOSTIC, KEEP_DRAW + 1)[0, KEEP_DRAW]
-        wanted = (offset + np.arange(settings.events_per_shell)) * (cumulative[-1] / settings.events_per_shell)
+        offset = uniforms(seed, s, 1, DIAGNOSTIC, KEEP_DRAW + 1)[0, KEEP_DRAW]
+        wanted = (offset + np.arange(n)) * (cumulative[-1] / n)
         chosen = places[np.minimum(np.searchsorted(cumulative, wanted, side="right"), places.size - 1)]
         kept.append((chosen // mass.shape[1], chosen % mass.shape[1]))
     path, step = (np.concatenate(column) for column in zip(*kept, strict=True))
