@@ -12,7 +12,7 @@ import pytest
 
 from examples.idm import IDM
 from examples.what_crashes_share import what_crashes_share
-from harness import estimate, replay
+from harness import estimate, load_campaign, replay
 from harness.campaign.campaign import Campaign
 from harness.errors import RunFolderError, TooManyFailedError
 from harness.families.cut_in.family import CUT_IN
@@ -53,6 +53,13 @@ def test_a_pool_that_is_used_up_ends_the_run(tmp_path):
     assert result.estimates["n_episodes"] < 1000
     assert set(re.findall(r"pool\.[a-z_]+", json.dumps(answer_in(result.folder)))) == {"pool.events_per_shell"}
     assert re.search(r"; raise pool\.events_per_shell to \d,?\d+$", answer_in(result.folder)["scope"])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("scenario", ["lead_brakes", "cut_out"])
+def test_a_vehicle_that_never_crashes_is_decided_before_the_pool_is_used_up(scenario, tmp_path):
+    found = run_here(load_campaign("brakes-8", [f"scenario={scenario}", "world.engine=twin"]), tmp_path / "run")
+    assert (found.exit_code, found.stopped_by) == (0, "below_reference")
 
 
 @pytest.mark.slow
