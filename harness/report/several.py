@@ -172,7 +172,7 @@ def _scope(content: Mapping[str, Any]) -> str:
         rhw = content["per_hour"]["rhw"]
         ended += f"{'' if rhw is None else words.reached_words(rhw, share(rhw))} (asked: ± {share(target)})"
     if content["stopped_by"] == "episodes" and (target is not None or content["decision"] is not None):
-        ended += words.go_on(content["n_episodes"], "--accept as before, " * (content["decision"] is not None))
+        ended += words.go_on(content["n_episodes"], content["n_crashes"], content["decision"])
     counted = ", that of the sum also of counted events," if content["counts_in_interval"] else ""
     return words.scope_words(content["confidence"], ended, counted)
 

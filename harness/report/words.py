@@ -257,15 +257,21 @@ def _scope(campaign: Campaign, manifest: Mapping[str, Any], told: Estimates) -> 
         more = "" if manifest.get("expected") and best.n_crashes else more  # `width_row` has it
         ended += f"{reached} (asked: ± {share(target)}){more}"
     elif stopped_by == "episodes":
-        ended = "all tests done" if campaign.accept is None else ended + go_on(best.n_episodes, "--accept as before, ")
+        decision, n = told.decision, (best.n_episodes, best.n_crashes)
+        ended = "all tests done" if decision is None else ended + go_on(*n, decision)
     elif stopped_by in ("rhw", "below_reference") and (given := campaign.testing.shells.statement) != ASSUMPTION_FREE:
         ended += f", given the {given}"
     return scope_words(best.confidence, ended)
 
 
-def go_on(n: int, limit: str = "") -> str:
-    """How a run goes on whose budget of ``n`` tests is used up; with the ``limit`` that was asked for."""
-    return f"; go on with {limit}--resume --set stop.episodes={2 * n}"
+def go_on(n: int, n_crashes: int = 0, decision: Mapping[str, Any] | None = None) -> str:
+    """How a run goes on whose budget of ``n`` tests is used up, and what a ``decision`` takes if none crashes."""
+    if decision is None:
+        return f"; go on with --resume --set stop.episodes={2 * n}"
+    times = end(decision["high"]) / decision["limit"]  # without a crash an upper limit falls with 1/n, or faster
+    known = not n_crashes and 1.0 < times < math.inf
+    enough = f": without a crash at most some {count(two_digits_up(n * times))} tests decide" if known else ""
+    return f"; go on with --accept as before, --resume --set stop.episodes={2 * n}{enough}"
 
 
 def reached_words(rhw: float, width: str) -> str:

@@ -12,7 +12,7 @@ from harness.numbers import number, plain
 from harness.records.folder import read_manifest
 from harness.report.rows import decided, held_back
 from harness.report.summary import read_run_folder
-from harness.report.words import LINES, WIDTH, columns, lines, short_answer
+from harness.report.words import LINES, WIDTH, columns, go_on, lines, short_answer
 from harness.runner.stored import stored_blocks
 from tests.stored_runs import answer_in, estimates, golden
 
@@ -186,3 +186,12 @@ def test_a_decision_without_an_upper_end_is_written_and_told(low, told):
     found = Decision(0.5, "assumption_free", 0.95, low, math.inf, 40, "r157-cc").to_json()
     assert (found["verdict"], found["high"], held_back(found)) == ("undecided", None, False)
     assert decided(found).remark == told
+
+
+@pytest.mark.parametrize(
+    ("n_crashes", "high", "said"), [(0, 2.6, True), (1, 2.6, False), (0, None, False), (0, 0.9, False)]
+)
+def test_what_an_undecided_limit_takes_is_told_where_none_crashed(n_crashes, high, said):
+    told = go_on(3000, n_crashes, {"high": high, "limit": 1.0})
+    assert told.startswith("; go on with --accept as before, --resume --set stop.episodes=6000")
+    assert told.endswith(": without a crash at most some 7,800 tests decide") == said
