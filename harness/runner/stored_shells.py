@@ -27,8 +27,8 @@ from harness.pool.build import campaign_pool
 from harness.pool.moved import FewPaths, OnPaths, environment_with, ranges, ratio_of
 from harness.pool.shells import Pool, design_shells, tested_limit
 from harness.progress import Progress
-from harness.records.folder import read_manifest
-from harness.records.reader import read_campaign
+from harness.records.folder import CAMPAIGN, read_manifest
+from harness.records.reader import read_campaign, require_campaign
 from harness.resolved import Resolved, resolve
 from harness.runner.stored import stored_blocks
 from harness.sampling.shells import stored_design
@@ -79,6 +79,7 @@ class StoredShells:
             expected = "tests of shells, of a vehicle that holds its speed until the event"
             raise CampaignError(option, found, expected, ELSEWHERE)
         here = resolve(campaign)
+        require_campaign(folder / CAMPAIGN, here.content_hash, manifest)
         design, pool = stored_design(folder), campaign_pool(here, progress)
         rebuilt = design_shells(pool, tested_limit(campaign))
         if design.strata != rebuilt.strata or not np.allclose(design.p, rebuilt.p, rtol=SAME_POOL):

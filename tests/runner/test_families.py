@@ -377,8 +377,10 @@ def test_each_scenario_may_have_a_file_of_its_own(tmp_path):
     assert " in SUMO’s twin, 1 scenario · " in told[0]
     assert "  events per hour of driving, given: lead brakes 0.3; other assumed" in "\n".join(told)
     (tmp_path / "mine.yaml").write_text("like: lead-brakes-1\nexposure: {per_hour: {value: 0.5, source: user}}\n")
-    with pytest.raises(RunFolderError, match="which made the records"):  # the tests are of the file as it was
-        estimate_families(tmp_path / "run")
+    folder = tmp_path / "run"
+    for again, of in ((estimate_families, folder), (other_traffic.sensitivity, folder / "lead_brakes")):
+        with pytest.raises(RunFolderError, match="which made the records"):  # the tests are of the file as it was
+            again(of)
     with pytest.raises(CampaignError, match="no file"):
         campaign("environments={lead_brakes: ./none.yaml}")
     with pytest.raises(CampaignError, match="cut-out-1"):
