@@ -217,6 +217,9 @@ def _of_sum(folder: Path, ranges: Mapping[str, tuple[float, float]], progress: P
             low, high = (end / exposure["per_hour"] for end in ends)
             known: Literal["counted", "assumed"] = "counted" if exposure["counted"] else "assumed"
             bars.append(_part(Bar(f"exposure {name}", known, ends, (low, high), (1.0, 1.0), (0.0, 0.0)), *shares))
+        if not of["n_crashes"]:
+            why = "its bars move the competent driver alone, and what it adds to the upper limit stands in none"
+            sys.stderr.write(f"note: of {name} no test crashed: {why}\n")
         progress.remark = f" ({name.replace('_', ' ')})"
         try:
             found = _of_one(folder / name, of_numbers[name], progress, per_event=True)

@@ -23,7 +23,7 @@ from harness.report.several import hour_lines
 from harness.resolved import resolve
 from harness.runner import other_traffic
 from harness.runner.compare import compare_campaigns
-from harness.runner.stored import estimate_families
+from harness.runner.stored import estimate_families, read_families
 from tests.in_process import one_process, run_here, run_with_workers
 from tests.stored_runs import copy_of
 
@@ -258,10 +258,14 @@ def test_what_moves_one_scenario_moves_the_sum_by_its_share(run, tmp_path, monke
 
     monkeypatch.setattr("harness.runner.other_traffic._of_one", of_one)
     assert main(["sensitivity", str(folder), "--range", "braking.stop_share=0:0.1"]) == 0
-    assert (
-        "of the numbers of cut_out only the exposure was moved (found: no number; needed: one)"
-        in capsys.readouterr().err
-    )
+    said = capsys.readouterr().err
+    assert "of the numbers of cut_out only the exposure was moved (found: no number; needed: one)" in said
+    assert "no test crashed" not in said
+    stored = read_families(folder)
+    stored["families"]["cut_out"] |= {"n_crashes": 0}
+    monkeypatch.setattr(other_traffic, "read_families", lambda _: stored)
+    other_traffic._of_sum(folder, {"braking.stop_share": (0.0, 0.1)}, Progress())
+    assert "note: of cut_out no test crashed: its bars move the competent driver alone" in capsys.readouterr().err
     bars = {bar["what"]: bar for bar in json.loads((folder / "sensitivity.json").read_text())["bars"]}
     assert len(bars) == 3 + 2
     for name, of in told["families"].items():
