@@ -202,7 +202,7 @@ class PoolSettings(Section):
     """relative standard error of surrogates' crash rates, four times that of few paths or beyond the boundary; none:
     the scenario's, 0.005 or 0.01"""
     events_per_shell: Whole = Field(25_000, ge=100, le=MOST_EVENTS)
-    """events kept of each shell: its most tests"""
+    """events kept of each shell: its most tests; twice as many outside the boundary where the AV follows"""
     shadow_paths: Whole = Field(500, ge=50, le=100_000)
     """baseline runs of a vehicle that acts before the event"""
     seed: Whole = Field(1, ge=0, lt=2**63)
