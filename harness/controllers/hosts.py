@@ -211,6 +211,14 @@ class Guard:
             return value, f"asked for {value:g} m/s2, outside of av.limits ({self.low:g} to {self.high:g})"
         return value, None
 
+    def not_judged(self, answer: Any) -> tuple[float, None]:
+        """An answer of the warm-up as a number, 0 if it is none: it is only told whether it brakes."""
+        try:
+            value = self.acceleration(answer)[0]
+        except OverflowError:
+            return 0.0, None
+        return (value if -1e9 < value < 1e9 else 0.0), None
+
     def _interrupt(self, _signal: int, _frame: FrameType | None) -> None:
         if not math.isnan(self._since):
             raise StepTimeoutError(self._limits[self._makes][1])
@@ -290,7 +298,7 @@ class VehicleHost(Host):
         what it raises counts.
         """
         answer, failures = np.zeros(observation.cell.size), dict[int, str]()
-        call, check = self.guard.call, None if warms_up else self.guard.acceleration
+        call, check = self.guard.call, self.guard.not_judged if warms_up else self.guard.acceleration
         with self.guard:
             for i, (k, _, *seen) in enumerate(zip(*(column.tolist() for column in observation), strict=True)):
                 if (controller := self._controllers[k]) is None:
@@ -300,7 +308,7 @@ class VehicleHost(Host):
                     place = "" if value is None else self.told_at(controller)  # of what is raised it is known
                     failures[k] = f"{'step, warming up' if warms_up else 'step'}: {wrong}{place}"
                     self._drop(k)
-                elif not warms_up or (type(value) in (float, int, np.float64) and -1e9 < value < 1e9):
+                else:
                     answer[i] = value
         return answer, failures
 

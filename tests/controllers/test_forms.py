@@ -102,6 +102,16 @@ class Slows:
         return max(self.target - seen.speed_mps, -2.0)
 
 
+class SlowsAsPolicy(Slows):
+    def step(self, seen):
+        return np.array([super().step(seen)])
+
+
+class SlowsInSingle(Slows):
+    def step(self, seen):
+        return np.float32(super().step(seen))
+
+
 class SlowsToNothing(Slows):
     """Its answers while it warms up, for 20 steps, are no numbers that anybody could use."""
 
@@ -127,6 +137,8 @@ class SlowsScript(TraciStyleController):
     ("form", "n"),
     [
         ("Slows, parameters: {own_mps: 20}", 40),
+        ("SlowsAsPolicy, parameters: {own_mps: 20}", 40),
+        ("SlowsInSingle, parameters: {own_mps: 20}", 40),
         ("SlowsBatch", 40),
         ("SlowsScript", 40),
         ("Slows", 0),
