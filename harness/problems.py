@@ -70,6 +70,8 @@ def _parts(details: ErrorDetails, section: type[BaseModel]) -> dict[str, str]:
         expected, mend = f"one of the keys {', '.join(known)}", did_you_mean(last, known)
     elif kind == "model_type":
         expected = f"a section with keys such as {', '.join(list(section.model_fields)[:4])}"
+        if "value" in section.model_fields and isinstance(value, int | float):
+            mend = f"Write {{value: {value}, source: user}}."
     elif last == "[key]" and kind != "literal_error":
         found, expected, mend = f"the name {found}", _pattern_in_words(context), "Choose another name."
     elif kind == "literal_error":

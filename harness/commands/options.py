@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Callable
 from itertools import chain, count, takewhile
 from pathlib import Path
@@ -146,7 +147,9 @@ def accepting(limit: str) -> list[str]:
     try:
         keys, value = ("crash_rate_below", "times_reference"), f"{float(limit)!r}"
     except ValueError:
-        times, _, driver = limit.rpartition("*")
+        times, star, driver = limit.rpartition("*")
+        if not star:  # 0.5r157-cc can mean nothing else
+            times, driver = re.findall(r"^([\d.]*)(.*)$", limit)[0]
         keys, value = (
             ("times_reference", "crash_rate_below"),
             f"{{driver: {json.dumps(driver)}, at_most: {times or 1}}}",

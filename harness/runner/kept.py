@@ -277,7 +277,7 @@ def require_few_failed(
     """
     if causes.total() > (most := campaign.run.max_failed_share) * n:
         cause = "".join(f", {n_such} of them with: {why}" for why, n_such in by_kind(causes).most_common(1))
-        mend = f"Fix the AV ({again}): a corrected one needs a new --out; or raise the share and go on with --resume."
+        mend = f"Fix the AV ({again}): a corrected one needs a new --out; or raise the share and go on (run: --resume)."
         found, expected = f"{causes.total()} of {n} {what} failed{cause}", f"a share of at most {most:g}"
         if re.search(r"\b(nan|infinity|inf)\b", cause, re.IGNORECASE):
             mend = f"With nobody ahead gap_m is infinite and lead_speed_mps NaN (docs/controllers.md). {mend}"
