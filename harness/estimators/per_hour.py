@@ -275,9 +275,11 @@ class PerHour:
         ratio, low, high = self.ratio(level)
         if counts and math.isfinite(high):
             low, high = self.limits_with_counts(level, lambda of, at: of.ratio(at)[1:])
+        over = self.over_assumed()
+        limits = None if over or math.isnan(ratio) else self.limits_over_assumed(level, ratio=True)
         return {
-            "reference": reference, "rate_per_hour": self.reference_rate,
-            "ratio": ratio, "ratio_low": low, "ratio_high": high, "over_assumed": self.over_assumed(),
+            "reference": reference, "rate_per_hour": self.reference_rate, "ratio": ratio, "ratio_low": low,
+            "ratio_high": high, "over_assumed": over, "limits_over_assumed": limits,
         }  # fmt: skip
 
     def _families(self, confidence: float) -> Iterator[dict[str, Any]]:

@@ -87,6 +87,9 @@ def beside_row(
         return Row("ratio", name, "no ratio", "", "such a driver never crashes here")
     found, ends = (beside if seen else {**beside, "ratio": 0.0}), beside["over_assumed"]
     over = "" if ends is None or ends[0] == ends[1] else f"{ratio(ends[0])} to {ratio(ends[1])} over assumed ranges"
+    if (limits := beside.get("limits_over_assumed")) is not None:
+        most = "no limit" if limits[1] is None else ratio(limits[1])
+        over = f"limits {ratio(limits[0])} to {most} over exposures"
     return Row("ratio", name, *ratio_texts(found, wide=from_below, from_below=from_below, softened=softened), over)
 
 

@@ -136,7 +136,11 @@ def test_ratio_to_the_competent_driver_and_what_assumed_exposures_do_to_it():
             ends.append(moved.rate / moved.reference_rate)
     assert hour.over_assumed() == pytest.approx((min(ends), max(ends)))
     no_crash = family("cut_out", [1e-6, 1e-3], [10, 36], [0, 0], THREE[2].exposure, CC)
-    assert PerHour([*THREE[:2], no_crash]).over_assumed() is None  # its rate is open, and so is what it moves
+    some = PerHour([*THREE[:2], no_crash])
+    assert some.over_assumed() is None  # its rate is open, and so is what it moves
+    told = some.to_json(0.9, 32.0)["beside"]
+    assert told["limits_over_assumed"] == some.limits_over_assumed(Level.two_sided(0.9), ratio=True)
+    assert hour.to_json(0.9, 32.0)["beside"]["limits_over_assumed"] is None
     assert math.isnan(PerHour([family("a", [1.0, 1.0], [9, 9], [1, 0], ASSUMED)]).ratio(LEVEL)[0])
 
 
