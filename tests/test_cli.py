@@ -11,6 +11,7 @@ from unittest.mock import Mock
 
 import click
 import pytest
+from junitparser import JUnitXml
 
 from harness.campaign.campaign import Campaign
 from harness.campaign.files import load_campaign
@@ -299,9 +300,11 @@ def test_estimate_writes_only_when_asked(folder, capsys):
     assert estimates(folder)["confidence"] == 0.5
 
 
-def test_an_earlier_verdict_does_not_outlive_a_run_that_comes_to_none(tmp_path, capsys):
+def test_a_run_that_comes_to_no_verdict_is_an_error_in_place_of_an_earlier_one(tmp_path, capsys):
     (verdict := tmp_path / "gate.xml").write_text("<testsuites/>")
     asked = ["--accept", "r157-cc", "--junit", str(verdict), "--out", str(tmp_path / "run")]
     assert main(["run", "tests.controllers.misbehaving:OnlyStepp", *asked]) == 2
-    assert not verdict.exists()
+    (case,) = JUnitXml.fromfile(str(verdict))
+    (error,) = next(iter(case)).result
+    assert "OnlyStepp" in error.message
     assert "error: " in capsys.readouterr().err

@@ -12,7 +12,7 @@ import click
 import harness
 from harness.commands import options
 from harness.commands.options import CAMPAIGN, FOLDER, examples, progress_bar
-from harness.commands.printing import holds_tests, print_either, print_json, print_table, prints_kept_in, say
+from harness.commands.printing import error_in, holds_tests, print_either, print_json, print_table, prints_kept_in, say
 from harness.errors import HarnessError
 from harness.numbers import leaves, words
 from harness.processes import start_server
@@ -133,7 +133,7 @@ def run(
         say(f"note: nothing to resume in {folder}: starts anew", err=True)
     if campaign.run.executor == "local":
         start_server()
-    with prints_kept_in(folder), progress_bar() as bar:
+    with error_in(junit, campaign.name), prints_kept_in(folder), progress_bar() as bar:
         result = harness.run(campaign, folder, workers=workers, resume=resume, progress=bar)
     from harness.runner.underway import RunResult
 
@@ -234,7 +234,7 @@ def compare(
     if folder is None:
         folder = options.RUNS / f"{a.name}-{re.sub('[^A-Za-z0-9_.-]+', '-', name_b)}"
     rhw = a.stop.rhw if any(parse_override(each).path == ("stop", "rhw") for each in overrides) else None
-    with prints_kept_in(folder), progress_bar() as bar:
+    with error_in(junit, " and ".join(labels)), prints_kept_in(folder), progress_bar() as bar:
         found = harness.compare(
             a, b, folder, workers=workers, progress=bar, labels=labels, stored=stored, margin=margin, rhw=rhw
         )

@@ -73,6 +73,19 @@ def show_error(error: HarnessError) -> None:
         say(f" {part.where}", *(f"  {name:<9} {text}".replace("`", "'") for name, text in told.items()), err=True)
 
 
+@contextmanager
+def error_in(junit: Path | None, suite: str) -> Iterator[None]:
+    """Write an error that comes to no verdict into the JUnit file, if one is asked for, as well."""
+    try:
+        yield
+    except HarnessError as error:
+        if junit is not None:
+            from harness.report.junit import Case, write_junit
+
+            write_junit(junit, suite, Case("run", str(error), "error", verdict=f"{error.where}: {error.found}"), [])
+        raise
+
+
 _AGAIN = "Nothing finished is lost: then give the same command again (`run` with --resume)."
 _HOW_TO_GO_ON = {
     "run": " Finished tests are kept: the same command with --resume goes on.",
