@@ -315,7 +315,7 @@ def script_step_s(av: AutomatedVehicle) -> float:
         _tell_once(f"{file} {told}: a test is one run of it from its first line, so leave out steps that only wait")
     if math.isinf(hardest):
         told = "sets a speed mode in which no decel bounds its braking; tests fail beyond av.limits"
-        _tell_once(f"{file} {told}: leave that call out, or use mode 31")
+        _tell_once(f"{file} {told}: if one should, use mode 31, and --set av.traci_style.decel_mps2=8, say")
     elif hardest > bound and "decel_mps2" not in av.traci_style.model_fields_set:
         told = f"asks for harder braking than {bound:g} m/s², the decel of SUMO's default type, and gets that"
         _tell_once(f"{file} {told}; of another type: --set av.traci_style.decel_mps2=8, say")

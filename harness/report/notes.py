@@ -74,7 +74,7 @@ NOTES = {
     "untested": "no test in {shells}: the interval allows for any share of crashes there",
     "runs_leave_nothing": "the lower limit is 0 in spite of {n:,} crashes: {runs:,} baseline runs alone leave "
     "±{alone:share} of the rate, as far as these can tell",
-    "used_up": "all events that the pool has kept of {shells} were tested",
+    "used_up": "the pool has no further event of {shells}: for more raise pool.events_per_shell, in a new folder",
     "refuted": "{n:,} crashes outside the library, beyond {boundary}: none of its statements holds for this vehicle",
     "own": "an estimator of your own: nobody has measured how often its interval covers",
     # why an estimator has no value
