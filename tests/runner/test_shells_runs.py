@@ -55,6 +55,19 @@ def test_a_pool_that_is_used_up_ends_the_run(tmp_path):
     assert re.search(r"; raise pool\.events_per_shell to \d,?\d+$", answer_in(result.folder)["scope"])
 
 
+def test_a_vehicle_that_fails_in_most_tests_is_given_up_after_few(tmp_path):
+    """Each may take as long as its time limit; one that fails in fewer is given up after 200."""
+    raises = (
+        "av={controller: 'tests.controllers.misbehaving:Always', parameters: {where: step, how: raises}}",
+        "world.engine=twin",
+        "stop.episodes=2000",
+    )
+    with pytest.raises(TooManyFailedError) as told:
+        run_here(campaign(*SHELLS, *raises), tmp_path / "run")
+    failed, _, n, *_ = told.value.found.split()
+    assert 20 <= int(n) < 2 * int(failed) < 200
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("scenario", ["lead_brakes", "cut_out"])
 def test_a_vehicle_that_never_crashes_is_decided_before_the_pool_is_used_up(scenario, tmp_path):

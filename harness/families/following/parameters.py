@@ -30,7 +30,7 @@ from harness.vocabulary import FloatArray, RecordArray
 ROAD_S = 55.0
 """Longest test: the road is 4 km long, and vehicles drive 40 m/s and more."""
 ROUNDED = 0.02
-"""By how much a rate may differ from events over hours."""
+"""By how much a rate may differ from events over hours [assumed]: as both are rounded."""
 EVENT_DTYPE = np.dtype(
     [
         ("peak_mps2", np.float64),  # how hard the vehicle ahead brakes
