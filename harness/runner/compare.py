@@ -155,16 +155,18 @@ def compare_campaigns(
         "decision": decision.to_json(), "to_decide": _to_decide(a, rounds, pairs),
         "ended": ended_by(a, rule, int(pairs.tests.sum())),
     }  # fmt: skip
-    told = labels or (a.name, b.name), LIBRARY_STATEMENT if rule.conditional else ASSUMPTION_FREE
+    labels = labels or (a.name, b.name)
+    statement = LIBRARY_STATEMENT if rule.conditional else ASSUMPTION_FREE
     if a.scenarios is None:
-        return _written(scenarios[0], ended, *told, code)
-    each = {}
-    for of in scenarios:
+        return _written(scenarios[0], ended, labels, statement, code)
+    decisions = {}
+    for scenario in scenarios:
         own = PairRule(a, margin, rhw)
-        own.observe(of.pairs)
-        each[of.name] = _decided(own, [of]).to_json()
-        _written(of, {"decision": each[of.name], "to_decide": None, "ended": "sum"}, *told, code)
-    return _sum_written(out, a, pairs, scenarios, ended, each, told[0], code)
+        own.observe(scenario.pairs)
+        decisions[scenario.name] = _decided(own, [scenario]).to_json()
+        ended_by_sum = {"decision": decisions[scenario.name], "to_decide": None, "ended": "sum"}
+        _written(scenario, ended_by_sum, labels, statement, code)
+    return _sum_written(out, a, pairs, scenarios, ended, decisions, labels, code)
 
 
 def _require_stored(stored: Path, folders: Sequence[str], campaign: Campaign, out: Path) -> None:
@@ -175,38 +177,40 @@ def _require_stored(stored: Path, folders: Sequence[str], campaign: Campaign, ou
     for folder in folders:
         mend = f"Read that code; then name {stored / CAMPAIGN} for A, which drives it anew."
         require_trust(stored / folder, read_manifest(stored / folder), code_of(campaign.av), mend)
-    if (stored / FAMILIES).is_file():  # that of one scenario is known by its hash
-        known = read_families(stored).get("campaign_crc32")
-        require_sum(stored / CAMPAIGN, known, (stored / CAMPAIGN).read_bytes(), MEND)
+    if (stored / FAMILIES).is_file():  # the campaign of one scenario is checked by its hash
+        crc32 = read_families(stored).get("campaign_crc32")
+        require_sum(stored / CAMPAIGN, crc32, (stored / CAMPAIGN).read_bytes(), MEND)
 
 
 def _ready(a: Campaign, b: Campaign, scenario: str, *, a_is_stored: bool) -> Both:
     """Both in one of their scenarios, refused where they cannot be run, or not be compared."""
     ready = []
-    for side, whole in zip("AB", (a, b), strict=True):
+    for side, campaign in zip("AB", (a, b), strict=True):
         with told_of(f"{side}, {scenario}" if a.scenarios else side):
-            ready.append(require_ready(whole.of_family(scenario) if whole.scenarios else whole, "compare"))
+            own = campaign.of_family(scenario) if campaign.scenarios else campaign
+            ready.append(require_ready(own, "compare"))
     require_comparable(*(each.campaign for each in ready))
     return _with_same_shells(*ready, a_is_stored=a_is_stored)
 
 
 def _written(
-    of: PairedScenario, ended: Mapping[str, Any], labels: tuple[str, str], asked: str, code: int
+    scenario: PairedScenario, ended: Mapping[str, Any], labels: tuple[str, str], statement: str, code: int
 ) -> Comparison:
-    """Write what is known of one scenario, and its page."""
-    resolved = [each.run.resolved for each in of.runs]
-    campaign, told = resolved[0].campaign, zip(SIDES, labels, resolved, strict=True)
+    """Write the comparison in one scenario, and its page."""
+    resolved = [underway.run.resolved for underway in scenario.runs]
+    campaign, sides = resolved[0].campaign, zip(SIDES, labels, resolved, strict=True)
     content = finite_json({
         "format": 1, "method": campaign.testing.method, "seed": campaign.seed, "scenario": campaign.scenario,
-        "campaigns": {side: {"label": label, "campaign_hash": own.content_hash} for side, label, own in told},
-        **paired_estimate(of.pairs, campaign.stop.confidence), **ended, "asked": asked,
+        "campaigns": {side: {"label": label, "campaign_hash": own.content_hash} for side, label, own in sides},
+        **paired_estimate(scenario.pairs, campaign.stop.confidence), **ended, "asked": statement,
         "unseen": resolved[0].parameters.unseen,
     })  # fmt: skip
-    for side, each in zip(SIDES, of.results, strict=True):
-        content[side] |= finite_json(doubts_of(each.shown.campaign, each.shown.manifest, each.shown.estimates))
-    write_sealed(of.folder / COMPARISON, content)
-    shown = [each.shown for each in of.results]
-    return Comparison(of.folder, content, code, write_comparison(of.folder, content, shown, replay_episode), shown)
+    shown = [result.shown for result in scenario.results]
+    for side, run in zip(SIDES, shown, strict=True):
+        content[side] |= finite_json(doubts_of(run.campaign, run.manifest, run.estimates))
+    folder = scenario.folder
+    write_sealed(folder / COMPARISON, content)
+    return Comparison(folder, content, code, write_comparison(folder, content, shown, replay_episode), shown)
 
 
 def _sum_written(
@@ -219,73 +223,73 @@ def _sum_written(
     labels: tuple[str, str],
     code: int,
 ) -> Comparison:
-    """Write what is known of the sum of several scenarios, and its page; each one's own has been written."""
+    """Write the comparison of the sum of several scenarios, and its page; those of each scenario are written."""
     confidence = campaign.stop.confidence
     level, sides = Level.two_sided(confidence), {}
     for i, side in enumerate(SIDES):
-        ready = {of.name: of.runs[i].run.resolved for of in scenarios}
-        told = {of.name: (of.results[i].shown.estimates, of.results[i].shown.manifest) for of in scenarios}
-        families = [OfFamily(of.name, of.exposure, of.tests_of_pairs(i)) for of in scenarios]
-        sides[side] = hour_answer(PerHour(families), ready, told, confidence)
+        ready = {scenario.name: scenario.runs[i].run.resolved for scenario in scenarios}
+        shown = {scenario.name: scenario.results[i].shown for scenario in scenarios}
+        answers = {name: (run.estimates, run.manifest) for name, run in shown.items()}
+        families = [OfFamily(each.name, each.exposure, each.tests_of_pairs(i)) for each in scenarios]
+        sides[side] = hour_answer(PerHour(families), ready, answers, confidence)
     content = finite_json({
         "format": 1, "method": campaign.testing.method, "seed": campaign.seed, "exposure": campaign.exposure,
         "campaigns": {side: {"label": label} for side, label in zip(SIDES, labels, strict=True)},
         **sides, **contrast(pairs, level), **ended, "confidence": confidence,
         "families": {
-            of.name: {**contrast(together([of], campaign), level), "decision": decisions[of.name]} for of in scenarios
+            each.name: {**contrast(together([each], campaign), level), "decision": decisions[each.name]}
+            for each in scenarios
         },
     })  # fmt: skip
     write_sealed(out / COMPARISON, content)
-    shown = [each.shown for of in scenarios for each in of.results]
-    return Comparison(out, content, code, write_comparison_of_sum(out, content), shown)
+    runs = [result.shown for scenario in scenarios for result in scenario.results]
+    return Comparison(out, content, code, write_comparison_of_sum(out, content), runs)
 
 
 def _decided(rule: PairRule, scenarios: Sequence[PairedScenario]) -> PairDecision:
-    """What a rule has found, after what was seen besides in these scenarios."""
-    doubts = (zip(*(of.runs[side].doubtful() for of in scenarios), strict=True) for side in (0, 1))
-    of_a, of_b = (tuple(map(sum, each)) for each in doubts)
-    return rule.decision.doubted(of_a[0], of_b[0], of_a[1] + of_b[1])
+    """The rule's decision, with the tests in these scenarios that keep it from being accepted."""
+    doubtful = [[scenario.runs[side].doubtful() for scenario in scenarios] for side in (0, 1)]
+    milder_a, milder_b = (sum(n_milder for n_milder, _ in of_side) for of_side in doubtful)
+    return rule.decision.doubted(milder_a, milder_b, sum(n for of_side in doubtful for _, n in of_side))
 
 
 def _to_decide(campaign: Campaign, rounds: PairRounds, pairs: Pairs) -> dict[str, Any] | None:
-    """How many pairs would decide what was left open, and what to set; None where nobody can tell."""
+    """Pairs that would decide what was left open, and what to set for them; None where that cannot be told."""
     rule = rounds.rule
     if rule.decision.verdict != "open" or math.isinf(times := rule.more_pairs(pairs)):
         return None
     needed = two_digits_up(int(pairs.tests.sum()) * times)
     settings = {"stop.episodes": needed} if needed > campaign.stop.episodes else {}
     if new_folder := (more := rounds.used_of_pool(pairs) * times) > 1.0:
-        kept = two_digits_up(campaign.pool.events_per_shell * more)
-        if kept > MOST_EVENTS:
+        per_shell = two_digits_up(campaign.pool.events_per_shell * more)
+        if per_shell > MOST_EVENTS:
             return None
-        settings["pool.events_per_shell"] = kept
+        settings["pool.events_per_shell"] = per_shell
     return {"pairs": needed, "settings": settings, "new_folder": new_folder}
 
 
 def require_comparable(a: Campaign, b: Campaign) -> None:
     """Refuse campaigns that differ in more than the vehicle, by a `CampaignError` that names every key that differs."""
-    keys = set(MAY_DIFFER)
-    of_a, of_b = (dict(leaves(each.model_dump(exclude=keys))) for each in (a, b))
-    if apart := [key for key in of_a | of_b if of_a.get(key) != of_b.get(key)]:
-        where = apart[0]
-        more = f"; also {', '.join(apart[1:])}" if len(apart) > 1 else ""
-        expected = f"campaigns that differ in {', '.join(sorted(keys))} only: pairs of tests need equal settings"
+    of_a, of_b = (dict(leaves(each.model_dump(exclude=set(MAY_DIFFER)))) for each in (a, b))
+    if differing := [key for key in of_a | of_b if of_a.get(key) != of_b.get(key)]:
+        where = differing[0]
+        more = f"; also {', '.join(differing[1:])}" if len(differing) > 1 else ""
+        expected = f"campaigns that differ in {', '.join(sorted(MAY_DIFFER))} only: pairs of tests need equal settings"
         mend = f"Make them equal, e.g. with --set {where}=…, which holds for both."
         raise CampaignError(where, f"{of_a.get(where)} in A and {of_b.get(where)} in B{more}", expected, mend)
 
 
 def _with_same_shells(a: Resolved, b: Resolved, *, a_is_stored: bool) -> Both:
-    """Both with the strata of the one that accelerates harder, where only that is tested beyond the envelope."""
-    narrow = [tested_limit(each.campaign) <= a.library.envelope_mps2 for each in (a, b)]
+    """Both with the same strata: where only one accelerates beyond the library's envelope, the other gets its own."""
+    narrow = [tested_limit(resolved.campaign) <= a.library.envelope_mps2 for resolved in (a, b)]
     if not any(narrow) or all(narrow):
         return a, b
     if narrow[0] and a_is_stored:
         expected = "a run with beyond_envelope: true, as B accelerates harder than the library's full throttle"
         mend = f"Name its {CAMPAIGN} for A, which drives it anew."
         raise CampaignError("testing.shells.beyond_envelope", "false in the stored run of A", expected, mend)
-    own = b if narrow[1] else a
-    campaign = own.campaign.replaced(("testing", "shells", "beyond_envelope"), True)
-    widened = replace(
-        own, campaign=campaign, content_hash=campaign.content_hash(own.parameters.content_hash(), own.challenge)
-    )
+    slower = b if narrow[1] else a
+    campaign = slower.campaign.replaced(("testing", "shells", "beyond_envelope"), True)
+    content_hash = campaign.content_hash(slower.parameters.content_hash(), slower.challenge)
+    widened = replace(slower, campaign=campaign, content_hash=content_hash)
     return (a, widened) if narrow[1] else (widened, b)

@@ -1,7 +1,7 @@
 """Drive two vehicles on the same events, round by round, in one scenario or in several side by side.
 
-The i-th event of a stratum is the same for both, as it follows from the campaign's seed and the pool. What either
-folder holds already, from an earlier call or because it is the copy of a stored run, is not driven again.
+The i-th event of a stratum is the same for both, as it follows from the campaign's seed and the pool. Tests that a
+folder holds already, from an earlier call or as the copy of a stored run, are not driven again.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ Both = tuple[Resolved, Resolved]
 
 
 class PairedScenario:
-    """Both vehicles in one scenario: ``folder``, runs of A and B, what these have left, and pairs so far."""
+    """Both vehicles in one scenario: its ``folder``, the ``runs`` of A and B, their ``results``, and the ``pairs``."""
 
     results: tuple[RunResult, RunResult]  # once all is driven
 
@@ -51,7 +51,7 @@ class PairedScenario:
 
     @property
     def name(self) -> str:
-        """That of the scenario."""
+        """Name of the scenario."""
         return self.runs[0].run.resolved.campaign.scenario
 
     @cached_property
@@ -65,17 +65,17 @@ class PairedScenario:
         return self.exposure.per_hour / self.runs[0].prescribed.design.p_counted
 
     def take_over(self, rule: PairRule) -> None:
-        """Take what the folders hold."""
-        for side, each in enumerate(self.runs):
-            for shard in each.drive(stored_requests(each.run.earlier), rule):
+        """Add the tests that the folders hold."""
+        for side, underway in enumerate(self.runs):
+            for shard in underway.drive(stored_requests(underway.run.earlier), rule):
                 self._tests.add(side, shard.block)
 
     def drive(self, added: IntArray, rule: PairRule) -> None:
-        """Drive so many more pairs per stratum, (S,), but for tests that are there."""
+        """Drive ``added`` more pairs per stratum, (S,), but for the tests that the folders hold."""
         self._n = self._n + added
-        for side, each in enumerate(self.runs):
+        for side, underway in enumerate(self.runs):
             tested = self._tests.tests(side)
-            for shard in each.drive_added(tested, np.maximum(self._n - tested, 0), rule):
+            for shard in underway.drive_added(tested, np.maximum(self._n - tested, 0), rule):
                 self._tests.add(side, shard.block)
         self.pairs = self._tests.first(self._n)
 
@@ -89,28 +89,32 @@ class PairedScenario:
 def drive_pairs(
     campaign: Campaign, ready: Mapping[Path, Both], rule: PairRule, workers: int | None, progress: Progress
 ) -> tuple[PairRounds, list[PairedScenario]]:
-    """Rounds of pairs of A and B in folders until the rule is content; returns them, and what there is of each."""
-    folders = {folder / side: own for folder, both in ready.items() for side, own in zip(SIDES, both, strict=True)}
+    """Drive rounds of pairs of A and B until the rule is content; returns the rounds, and each scenario's pairs.
+
+    ``ready`` are both vehicles, by the folder of each scenario.
+    """
+    folders = {
+        folder / side: resolved for folder, both in ready.items() for side, resolved in zip(SIDES, both, strict=True)
+    }
     with taken(folders, resume=True) as places:
         with begun(places, workers, progress) as runs:
-            scenarios = [
-                PairedScenario(*each, campaign.exposure) for each in zip(ready, runs[::2], runs[1::2], strict=True)
-            ]
-            available = [of.runs[0].prescribed.available for of in scenarios]
+            folder_and_runs = zip(ready, runs[::2], runs[1::2], strict=True)
+            scenarios = [PairedScenario(folder, a, b, campaign.exposure) for folder, a, b in folder_and_runs]
+            available = [scenario.runs[0].prescribed.available for scenario in scenarios]
             rounds = PairRounds(campaign, together(scenarios, campaign), available, rule)
             progress.stage("tests of A and B", 2 * campaign.stop.episodes if rule.ends_at_rhw else None)
-            for of in scenarios:
-                of.take_over(rule)
+            for scenario in scenarios:
+                scenario.take_over(rule)
             while np.concatenate(added := rounds.next_round(together(scenarios, campaign))).any():
-                for of, more in zip(scenarios, added, strict=True):
-                    of.drive(more, rule)
+                for scenario, of_scenario in zip(scenarios, added, strict=True):
+                    scenario.drive(of_scenario, rule)
                 if rule.observe(together(scenarios, campaign)):
                     break
             for underway in runs:
                 underway.require_tests()
-        for of in scenarios:
-            a, b = (each.finish(rule, of_sum=campaign.scenarios is not None) for each in of.runs)
-            of.results = a, b
+        for scenario in scenarios:
+            a, b = (underway.finish(rule, of_sum=campaign.scenarios is not None) for underway in scenario.runs)
+            scenario.results = a, b
         return rounds, scenarios
 
 
@@ -118,29 +122,29 @@ def together(scenarios: list[PairedScenario], campaign: Campaign) -> Pairs:
     """The pairs of one scenario, per test; of several, those of all, per hour."""
     if campaign.scenarios is None:
         return scenarios[0].pairs
-    each = tuple(own for of in scenarios for own in of.pairs.each)
-    return Pairs(each, tuple(of.tests_per_hour for of in scenarios))
+    pairs = tuple(own for scenario in scenarios for own in scenario.pairs.each)
+    return Pairs(pairs, tuple(scenario.tests_per_hour for scenario in scenarios))
 
 
 def stored_requests(earlier: Earlier) -> Iterator[ShardRequest]:
-    """Tests that a folder holds, as they were asked for."""
-    taken = Counter[int]()
+    """The requests that a folder's tests were made by: a part each, with its draws from strata."""
+    n_drawn = Counter[int]()
     for index, part in enumerate(earlier.parts):
         tables = earlier.tables(part.first_episode, part.n_episodes)
-        if tables is None:  # what is gone is driven anew, and so is all that follows
+        if tables is None:  # a file is gone: its tests and all later ones are driven anew
             return
         stratum = tables["episodes"]["component"].to_numpy()
         edges = [0, *(np.flatnonzero(np.diff(stratum)) + 1).tolist(), stratum.size]
         draws = []
         for first, end in pairwise(edges):
             s, n = int(stratum[first]), end - first
-            draws.append(Draw(s, taken[s], n))
-            taken[s] += n
+            draws.append(Draw(s, n_drawn[s], n))
+            n_drawn[s] += n
         yield ShardRequest(index, part.first_episode, part.n_episodes, tuple(draws))
 
 
 def copy_stored(stored: Path, folder: Path, resolved: Resolved) -> None:
-    """Copy a stored run of A, and no other (`RunFolderError`), to where A is to be run, unless it is there already."""
+    """Copy a stored run of A to the folder of A, unless that has files; a `RunFolderError` if it is no run of A."""
     if folder.exists() and any(folder.iterdir()):
         return
     manifest = read_manifest(stored)

@@ -42,7 +42,7 @@ from harness.strata import Assumed
 from harness.vocabulary import FAMILIES
 
 FAR_ABOVE = 10.0
-"""Of what is assumed at most, from which on an exposure is likely to be of other events [assumed]."""
+"""Times the highest shipped exposure: one given beyond that is likely to count other events [assumed]."""
 
 
 @checked("harness.run")
@@ -115,17 +115,17 @@ class Hours(ShownInPython):
 
 def run_families(campaign: Campaign, out: Path, *, workers: int | None, resume: bool, progress: Progress) -> Hours:
     """Run the scenarios of a campaign until their sum is known; see `harness.run`."""
-    names, began = campaign.scenarios or [], time.monotonic()
+    began = time.monotonic()
     ready = {}
-    for name in names:
+    for name in campaign.scenarios or []:
         with told_of(name):
             ready[name] = require_ready(campaign.of_family(name))
     require_same_driver(campaign, ready)
     rule = RoundRule(campaign)
     with ExitStack() as held:
         held.enter_context(sole_use(out))
-        require_no_other(out, [*names, FAMILIES, CAMPAIGN])
-        places = held.enter_context(taken({out / name: each for name, each in ready.items()}, resume=resume))
+        require_no_other(out, [*ready, FAMILIES, CAMPAIGN])
+        places = held.enter_context(taken({out / name: resolved for name, resolved in ready.items()}, resume=resume))
         began -= max(float(earlier.get("wall_time_s") or 0.0) for _, earlier in places.values())
         if any(earlier["n_episodes"] for _, earlier in places.values()):
             require_same_shares(out, campaign)
@@ -133,18 +133,19 @@ def run_families(campaign: Campaign, out: Path, *, workers: int | None, resume: 
         write_bytes(out / CAMPAIGN, yaml)
         hour, results, decision = _run(campaign, places, rule, workers, progress)
     missed = campaign.stop.rhw is not None and not rule.look.stopped
-    told = {name: (each.shown.estimates, each.shown.manifest) for name, each in results.items()}
-    answer = hour_answer(hour, ready, told, campaign.stop.confidence)
+    answers = {name: (result.shown.estimates, result.shown.manifest) for name, result in results.items()}
+    answer = hour_answer(hour, ready, answers, campaign.stop.confidence)
     vehicle, parameters = vehicle_words(campaign.av, script=next(iter(ready.values())).script)
-    asked = {
+    content = {
         "format": 1, "name": campaign.name, "campaign_crc32": zlib.crc32(yaml),
         "seed": campaign.seed, "engine": campaign.world.engine,
         "exposure": campaign.exposure, "counts_above_mps": campaign.crash.counts_above_mps,
         "asked_rhw": campaign.stop.rhw, "each_family": campaign.stop.each_family,
         "stopped_by": ended_by(campaign, rule, hour.totals[0]), "decision": decision and decision.to_json(),
         "vehicle": vehicle, "parameters": parameters, "wall_time_s": round(time.monotonic() - began, 3),
+        **answer,
     }  # fmt: skip
-    content = finite_json({**asked, **answer})
+    content = finite_json(content)
     write_sealed(out / FAMILIES, content)
     return Hours(out, content, write_hours(out, content), results, exit_code(decision, missed=missed))
 
@@ -157,14 +158,14 @@ def _run(
         runs = dict(zip(campaign.scenarios or [], each_run, strict=True))
         seen = {name: SeenShells(underway.prescribed.design) for name, underway in runs.items()}
         exposures = {name: exposure_of(underway.run.resolved, campaign.exposure) for name, underway in runs.items()}
-        hour = PerHour([OfFamily(name, exposures[name], of) for name, of in seen.items()])
+        hour = PerHour([OfFamily(name, exposures[name], tests) for name, tests in seen.items()])
         rounds = HourRounds(campaign, hour, [underway.prescribed.available for underway in runs.values()], rule)
         n_held = sum(underway.run.earlier.n_episodes for underway in runs.values())
         progress.stage("tests of all scenarios", None, done=n_held)
-        while np.concatenate(added_to := rounds.next_round(hour)).any():
-            for of, added in zip(hour.families, added_to, strict=True):
-                for shard in runs[of.family].drive_added(of.tally.tests, added, rule):
-                    of.seen.add(shard.block if campaign.accept is None else shard.block.cut_off_as_failed())
+        while np.concatenate(added_by_family := rounds.next_round(hour)).any():
+            for part, added in zip(hour.families, added_by_family, strict=True):
+                for shard in runs[part.family].drive_added(part.tally.tests, added, rule):
+                    part.seen.add(shard.block if campaign.accept is None else shard.block.cut_off_as_failed())
             if rule.observe(hour) and not any(underway.run.is_behind for underway in runs.values()):
                 break
         for underway in runs.values():
@@ -172,7 +173,7 @@ def _run(
     results = {name: underway.finish(rule, of_sum=True) for name, underway in runs.items()}
     if campaign.accept is not None:  # tests that were cut off count as crashes in its decision alone
         seen = {name: SeenShells.of_blocks(underway.run.blocks) for name, underway in runs.items()}
-        hour = PerHour([of._replace(seen=seen[of.family]) for of in hour.families])
+        hour = PerHour([part._replace(seen=seen[part.family]) for part in hour.families])
     decision = rule.look.decision and doubted(rule.look.decision, runs.values())
     return hour, results, decision
 
@@ -180,59 +181,61 @@ def _run(
 def hour_answer(
     hour: PerHour,
     ready: Mapping[str, Resolved],
-    told: Mapping[str, tuple[Estimates, Mapping[str, Any]]],
+    answers: Mapping[str, tuple[Estimates, Mapping[str, Any]]],
     confidence: float,
     *,
     counts: bool = False,
 ) -> dict[str, Any]:
-    """The sum as ``families.json`` has it, and of each scenario what its estimates and manifest have ``told``.
+    """The sum as ``families.json`` has it, and each scenario's part, with its ``answers``: its estimates and manifest.
 
     Crashes per km are those per hour at the mean speed of scenarios in which the AV follows.
     """
-    follow = [each for each in ready.values() if each.family.follows] or list(ready.values())
-    speeds = [each.family.mean_speed_mps(each.environment) for each in follow]
-    left_open = {name: Assumed(**of) for name, (_, manifest) in told.items() if (of := manifest.get("assumed"))}
-    hour = PerHour([of._replace(assumed=left_open.get(of.family)) for of in hour.families])
-    found = hour.to_json(confidence, sum(speeds) / len(speeds), counts=counts)
-    for part, (name, (estimates, manifest)) in zip(hour.families, told.items(), strict=True):
-        of = found["families"][name]
-        of["median_impact_mps"] = None if estimates.severity is None else estimates.severity.median_mps
-        of |= doubts_of(ready[name].campaign, manifest, estimates, part.per_hour)
-        if (left := estimates.assumed) and left.times:  # per event, of which there are more per test in other traffic
+    follow = [resolved for resolved in ready.values() if resolved.family.follows] or list(ready.values())
+    speeds = [resolved.family.mean_speed_mps(resolved.environment) for resolved in follow]
+    assumed = {name: Assumed(**stored) for name, (_, run) in answers.items() if (stored := run.get("assumed"))}
+    hour = PerHour([part._replace(assumed=assumed.get(part.family)) for part in hour.families])
+    content = hour.to_json(confidence, sum(speeds) / len(speeds), counts=counts)
+    for part, (name, (estimates, manifest)) in zip(hour.families, answers.items(), strict=True):
+        entry = content["families"][name]
+        entry["median_impact_mps"] = None if estimates.severity is None else estimates.severity.median_mps
+        entry |= doubts_of(ready[name].campaign, manifest, estimates, part.per_hour)
+        if (per_test := estimates.assumed) and per_test.times:  # other traffic has other numbers of events per test
             low, high = part.events_moved.tolist()
-            of["assumed"] = replace(left, times=(left.times[0] / low, left.times[1] / high))
-    return found
+            entry["assumed"] = replace(per_test, times=(per_test.times[0] / low, per_test.times[1] / high))
+    return content
 
 
-def exposure_of(resolved: Resolved, given: Mapping[str, float]) -> Exposure:
-    """How often events of a scenario are met: the shipped number, or the one that is given for it."""
-    shipped, name = resolved.family.exposure(resolved.environment, resolved.parameters), resolved.campaign.scenario
-    if (own := given.get(name)) is not None and own > FAR_ABOVE * shipped.high:
+def exposure_of(resolved: Resolved, own_exposures: Mapping[str, float]) -> Exposure:
+    """How often events of a scenario are met per hour: the shipped number, or the campaign's own."""
+    shipped = resolved.family.exposure(resolved.environment, resolved.parameters)
+    name = resolved.campaign.scenario
+    if (own := own_exposures.get(name)) is not None and own > FAR_ABOVE * shipped.high:
         times = f"{own / shipped.per_hour:.0f} times the shipped one, of events in scope"
         sys.stderr.write(f"note: exposure {name}={own:g} is {times} (docs/families.md)\n")
-    return own_exposure(shipped, given.get(name))
+    return own_exposure(shipped, own)
 
 
 def require_same_driver(campaign: Campaign, ready: Mapping[str, Resolved]) -> None:
     """Refuse (`CampaignError`) a limit beside another driver than the one that the sum is held against."""
     if campaign.accept is None or campaign.accept.times_reference is None:
         return
-    asked = campaign.accept.times_reference.driver
-    for name, each in ready.items():
-        if (first := next(iter(each.library.references), "")) != asked:
+    driver = campaign.accept.times_reference.driver
+    for name, resolved in ready.items():
+        if (first := next(iter(resolved.library.references), "")) != driver:
             expected = f"{first}, the first reference driver of {name}: the sum is held against that of each scenario"
             mend = f"Write {first}, or one scenario."
-            raise CampaignError("accept.times_reference.driver", f"'{asked}'", expected, mend)
+            raise CampaignError("accept.times_reference.driver", f"'{driver}'", expected, mend)
 
 
 def require_same_shares(out: Path, campaign: Campaign) -> None:
-    """Refuse (`RunFolderError`) to go on where other tests would have been run: by exposures they are allocated."""
-    was, mend = load_campaign(out / CAMPAIGN, check_files=False), "Repeat it, or choose another folder with --out."
-    then, now = ([f"{name}={of:g}" for name, of in each.exposure.items()] for each in (was, campaign))
+    """Refuse (`RunFolderError`) to go on with tests that would now be allocated otherwise: exposures decide that."""
+    was = load_campaign(out / CAMPAIGN, check_files=False)
+    mend = "Repeat it, or choose another folder with --out."
+    then, now = ([f"{name}={per_hour:g}" for name, per_hour in each.exposure.items()] for each in (was, campaign))
     if sorted(then) != sorted(now):
         found, expected = (f"exposure {', '.join(each) or 'as shipped'}" for each in (then, now))
         if set(was.exposure) <= set(campaign.exposure):  # else an estimate would keep one that is not asked for
-            options = "".join(f" --exposure {each}" for each in now)
+            options = "".join(f" --exposure {exposure}" for exposure in now)
             mend = f"Without new tests: harness estimate {out}{options}. Or choose another folder with --out."
         raise RunFolderError(str(out), f"tests allocated with {found}", expected, mend)
     then, now = (["each_family"] * each.stop.each_family + (each.scenarios or []) for each in (was, campaign))
@@ -241,8 +244,8 @@ def require_same_shares(out: Path, campaign: Campaign) -> None:
 
 
 def require_no_other(out: Path, names: Sequence[str]) -> None:
-    """Refuse (`RunFolderError`) a folder that holds something else than what is so called, or written beside it."""
-    known = {*names, PRINTED, SENSITIVITY, "report.html"}
-    if other := sorted(each.name for each in out.iterdir() if each.name[0] != "." and each.name not in known):
+    """Refuse (`RunFolderError`) a folder with other entries than ``names`` and what commands write beside them."""
+    ours = {*names, PRINTED, SENSITIVITY, "report.html"}
+    if other := sorted(path.name for path in out.iterdir() if path.name[0] != "." and path.name not in ours):
         expected = "a new or empty folder, or one of the same scenarios"
         raise RunFolderError(str(out), f"a folder with {other[0]}", expected, "Choose another folder with --out.")

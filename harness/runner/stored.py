@@ -1,4 +1,4 @@
-"""Stored runs: estimate again from the records; run an episode again, bit for bit, to look at it; write pages anew."""
+"""Stored runs: estimate again from the records, replay a test bit for bit, write pages anew."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ _FINISH = "Run `harness run` with --resume, which makes missing tests."
 
 
 class StoredEstimates(ShownInPython, dict[str, Any]):
-    """Content of ``estimates.json`` or ``families.json``; shown, the short answer, or a line each ``by_estimator``."""
+    """Content of ``estimates.json`` or ``families.json``; printed, the short answer, or a line per estimator."""
 
     def __init__(self, content: Mapping[str, Any], folder: Path, *, by_estimator: bool = False) -> None:
         super().__init__(content)
@@ -67,9 +67,9 @@ class StoredEstimates(ShownInPython, dict[str, Any]):
         return run_lines(read_campaign(folder, manifest), manifest, self, folder / "report.html")
 
     def _plot(self) -> Plot | None:
-        """The map of its tests, where what is told is of their own traffic."""
-        none = self.get("elsewhere") or "families" in self
-        return None if none else where_plot(read_run_folder(self._folder, self))
+        """The map of its tests; none where the answer is about other traffic, or about several scenarios."""
+        no_map = self.get("elsewhere") or "families" in self
+        return None if no_map else where_plot(read_run_folder(self._folder, self))
 
 
 @checked("harness.estimate")
@@ -125,15 +125,16 @@ def stored_blocks(folder: Path, *, moments: bool) -> Iterator[Block]:
     if not (n_counted := int(manifest["n_episodes"])):
         raise no_episodes(folder)
     source = source_of(campaign)
-    design, needed = stored_design(folder) if campaign.sampling.strata else None, list(source.columns)
-    needed += BASELINE_COLUMNS if design is not None and design.candidates else ()
+    design = stored_design(folder) if campaign.sampling.strata else None
+    columns = list(source.columns)
+    columns += BASELINE_COLUMNS if design is not None and design.candidates else ()
     ratios = list(MOMENT_COLUMNS) if moments and campaign.sampling.mixes_steps else []
     keeps = ratios and campaign.records.moments != "none"
-    none = moments_schema((), len(campaign.surrogates)).empty_table().select(ratios) if keeps else None
+    no_steps = moments_schema((), len(campaign.surrogates)).empty_table().select(ratios) if keeps else None
 
     def read(part: Part) -> Block:
-        steps = read_kept(folder, part, "moments", ratios) if ratios and "moments" in part.files else none
-        return block_from_tables(campaign, read_kept(folder, part, "episodes", needed), steps, design)
+        steps = read_kept(folder, part, "moments", ratios) if ratios and "moments" in part.files else no_steps
+        return block_from_tables(campaign, read_kept(folder, part, "episodes", columns), steps, design)
 
     n = 0
     for block in made_ahead(read, manifest["parts"], N_READERS):
@@ -149,7 +150,7 @@ def stored_blocks(folder: Path, *, moments: bool) -> Iterator[Block]:
 
 
 _TRUST = "Look at stored motion alone (--stored), which runs no code; or read that code, and then add --trust."
-_UNLIKE_BITS = ("episode", "seed", "failure")
+_NOT_COMPARED = ("episode", "seed", "failure")
 
 
 @checked("harness.replay")
@@ -193,8 +194,7 @@ def replay_episode(
     if not stored:
         _require_reproducible(manifest, campaign)
         if not trust:
-            own = campaign.testing.own_challenge, *campaign.own_surrogates.values()
-            for code in (code_of(campaign.av), *own):
+            for code in (code_of(campaign.av), campaign.testing.own_challenge, *campaign.own_surrogates.values()):
                 require_trust(folder, manifest, code, _TRUST)
         return _simulated(folder, manifest, campaign, tables, episode)
     if "traces" not in tables or not tables["traces"].num_rows:
@@ -235,26 +235,27 @@ def _replay(resolved: Resolved, folder: Path, episode: int, stored: pa.Table) ->
 
 
 def code_changed(manifest: Mapping[str, Any], campaign: Campaign) -> str:
-    """Whether the vehicle's code has been changed since a run, in a sentence if so."""
+    """A sentence where the vehicle's code has been changed since a run, else an empty one."""
     if manifest.get("controller_sha256") == require_controller(campaign.av):
         return ""
     return f"{campaign.av.controller}, or a file that it is made of, has been changed since the run."
 
 
 def changed_since(manifest: Mapping[str, Any], campaign: Campaign) -> str:
-    """What may have made a replay differ, by what the manifest of the run knows."""
-    here, there = {**versions(), "CPU": cpu_name()}, {**manifest.get("versions", {}), "CPU": manifest.get("cpu")}
+    """Sentences on what may have made a replay differ, by what the run's manifest says."""
+    here = {**versions(), "CPU": cpu_name()}
+    there = {**manifest.get("versions", {}), "CPU": manifest.get("cpu")}
     other = ", ".join(f"{name} {was} (here {here.get(name)})" for name, was in there.items() if was != here.get(name))
-    found = [f"The run was made with {other}; bits are promised for equal ones."] if other else []
+    causes = [f"The run was made with {other}; bits are promised for equal ones."] if other else []
     if code := code_changed(manifest, campaign):
-        found.append(code)
+        causes.append(code)
     elif campaign.av.model is None:
         same = "" if other else "Versions, CPU and the controller's files are the run's. "
-        found.append(
+        causes.append(
             f"{same}Or the vehicle does not do the same again: random numbers of its own, memory of earlier tests, "
             "or a file that it reads. `harness av-check --tests 400` looks for that."
         )
-    return " ".join(found) or "Versions and CPU are the run's: the records have been changed, or it is a defect."
+    return " ".join(causes) or "Versions and CPU are the run's: the records have been changed, or it is a defect."
 
 
 def _require_reproducible(manifest: dict[str, Any], campaign: Campaign) -> None:
@@ -271,7 +272,7 @@ def _require_reproducible(manifest: dict[str, Any], campaign: Campaign) -> None:
 
 
 def _stored(folder: Path, manifest: dict[str, Any], episode: int) -> dict[str, pa.Table]:
-    """Rows of the episode in the episodes and traces tables."""
+    """The run's rows of one test, by table, without moments."""
     for part in manifest["parts"]:
         if part.first_episode <= episode < part.end:
             tables = {name: read_kept(folder, part, name) for name in part.files if name != "moments"}
@@ -283,8 +284,8 @@ def _stored(folder: Path, manifest: dict[str, Any], episode: int) -> dict[str, p
 
 
 def _equal(again: pa.Table, stored: pa.Table) -> bool:
-    """By bits: what is written of a float is that float alone, 0.0 and -0.0 differ, and NaN equals itself."""
-    columns = [name for name in again.column_names if name not in _UNLIKE_BITS]
+    """Compare by bits: ``repr`` gives each float a text of its own, 0.0 and -0.0 differ, and NaN equals itself."""
+    columns = [name for name in again.column_names if name not in _NOT_COMPARED]
     return repr(again.select(columns).to_pylist()) == repr(stored.select(columns).to_pylist())
 
 
@@ -310,7 +311,7 @@ def estimate_families(
     *,
     counts: bool = False,
 ) -> StoredEstimates:
-    """Answer anew from the tests of several scenarios; returns the content of ``families.json``.
+    """Estimate a stored run of several scenarios; returns the content of ``families.json``.
 
     Parameters
     ----------
@@ -325,25 +326,28 @@ def estimate_families(
 
     Raises `HarnessError`: a run is missing or damaged, or an exposure is of no scenario in it.
     """
-    folder, exposure, families, ready, told = Path(folder), exposure or {}, [], {}, {}
-    names = list((stored := read_families(folder))["families"])
+    folder, exposure = Path(folder), exposure or {}
+    stored = read_families(folder)
+    names = list(stored["families"])
     if unknown := sorted(set(exposure) - set(names)):
         found = f"an exposure of {', '.join(unknown)}"
         raise HarnessError("--exposure", found, f"one of {', '.join(names)}", "Name a scenario of this folder.")
-    given = {**stored["exposure"], **exposure}
-    for name, of in ((name, folder / name) for name in names):
-        manifest, seen = read_manifest(of), SeenShells.of_blocks(stored_blocks(of, moments=False))
-        resolved = ready[name] = resolve(read_campaign(of, manifest))
-        require_campaign(of / CAMPAIGN, resolved.content_hash, manifest)  # exposures are those of its file
-        families.append(OfFamily(name, exposure_of(resolved, given), seen))
-        told[name] = read_as(Estimates, of / ESTIMATES, mend=MEND), manifest
-    answer = hour_answer(PerHour(families), ready, told, confidence or stored["confidence"], counts=counts)
+    exposures = {**stored["exposure"], **exposure}
+    families, ready, answers = [], {}, {}
+    for name in names:
+        run = folder / name
+        manifest, tests = read_manifest(run), SeenShells.of_blocks(stored_blocks(run, moments=False))
+        resolved = ready[name] = resolve(read_campaign(run, manifest))
+        require_campaign(run / CAMPAIGN, resolved.content_hash, manifest)  # exposures are those of its file
+        families.append(OfFamily(name, exposure_of(resolved, exposures), tests))
+        answers[name] = read_as(Estimates, run / ESTIMATES, mend=MEND), manifest
+    answer = hour_answer(PerHour(families), ready, answers, confidence or stored["confidence"], counts=counts)
     ran = stored.pop("ran", None) or {name: stored[name] for name in ("exposure", "decision")}
-    was = [exposure_of(of, ran["exposure"]).per_hour for of in ready.values()]
-    now = [of.exposure.per_hour for of in families]
-    moved = not np.allclose(was, now, rtol=1e-9, atol=0.0)  # a verdict is of those of its run
+    was = [exposure_of(resolved, ran["exposure"]).per_hour for resolved in ready.values()]
+    now = [family.exposure.per_hour for family in families]
+    moved = not np.allclose(was, now, rtol=1e-9, atol=0.0)  # the run's verdict holds for the run's exposures alone
     stored |= {"decision": None, "ran": ran} if moved else {"decision": ran["decision"]}
-    return StoredEstimates(finite_json({**stored, "exposure": given, **answer}), folder)
+    return StoredEstimates(finite_json({**stored, "exposure": exposures, **answer}), folder)
 
 
 @checked("harness.write_report")
@@ -368,15 +372,15 @@ def write_report(folder: str | Path) -> Path:
 
 
 def _write_comparison(folder: Path) -> Path:
-    """Of the comparison, and of each scenario's where it is a sum."""
+    """Write the page of a comparison; where it is a sum, those of its scenarios as well."""
     stored = read_as(dict[str, Any], folder / COMPARISON, mend=COMPARE_AGAIN)
     if "families" in stored:
         for name in stored["families"]:
             _write_comparison(folder / name)
         return write_comparison_of_sum(folder, stored)
     runs = [read_run_folder(folder / side) for side in ("a", "b")]
-    for run, of in zip(runs, stored["campaigns"].values(), strict=True):
-        if (found := run.manifest["campaign_hash"]) != of["campaign_hash"]:
-            expected = f"campaign {of['campaign_hash']} ({COMPARISON})"
-            raise RunFolderError(str(run.path), f"a run of campaign {found}", expected, COMPARE_AGAIN)
+    for run, campaign in zip(runs, stored["campaigns"].values(), strict=True):
+        if (campaign_hash := run.manifest["campaign_hash"]) != campaign["campaign_hash"]:
+            expected = f"campaign {campaign['campaign_hash']} ({COMPARISON})"
+            raise RunFolderError(str(run.path), f"a run of campaign {campaign_hash}", expected, COMPARE_AGAIN)
     return write_comparison(folder, stored, runs, replay_episode)

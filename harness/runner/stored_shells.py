@@ -1,10 +1,11 @@
 """A stored run of shells in other traffic: the shells' probabilities there, and crash shares as they were.
 
-Traffic decides how probable an event is; what a vehicle makes of one, only through what LV and BV do afterwards, and
-through which events of a shell there are. Crash shares within shells are taken to be the same. The reference drivers,
-of which no shell is made, tell how far that holds: their rates follow by the same rule, and are known besides. Of a
-vehicle that crashes on few of the events of its shells they do not: which these are may change. Of such a vehicle
-there are upper limits alone, in traffic close by; of traffic with events that no test stands for nothing is said.
+Traffic decides how probable an event is. Whether a vehicle crashes on one depends on traffic only through what LV and
+BV do afterwards, and through which events a shell has. So crash shares within shells are taken to be the same. The
+reference drivers, of which no shell is made, show how far that holds: their rates by the same rule are compared with
+those that the pool enumerates. They do not show it for a vehicle that crashes on few events of its shells, as other
+traffic may have more of these. It gets upper limits alone, in traffic close by. Traffic with events that no test stands
+for is refused.
 """
 
 from __future__ import annotations
@@ -42,20 +43,21 @@ SAME_POOL = 0.05
 MOST_OFF = 0.05
 """How far the rate of a reference driver may come out wrong [assumed; docs/environment.md says what it misses]."""
 LEAST_SHARE = 0.5
-"""Of the events that crash, in the mean over a rate, from which on shares are taken to stay the same. Where events
-take time, rates of drivers with 0.58 or more came out wrong by at most 6 %, with 0.33 by 16 %, with 0.1 by 28 %,
+"""Mean share of a shell's events on which the vehicle crashes, from which on shares are taken to stay the same. Where
+events take time, rates of drivers with 0.58 or more came out wrong by at most 6 %, with 0.33 by 16 %, with 0.1 by 28 %,
 with 0.02 by more than a factor of 3 (`python -m benchmarks.other_traffic`)."""
 FAR_OFF = 0.5
-"""The same in traffic close by, where each rate is taken to be as wrong as that [assumed]."""
+"""As `MOST_OFF`, in traffic close by, where each rate is taken to be as wrong as the drivers' [assumed]."""
 OPTION = "--environment"
 ELSEWHERE = "Run the campaign in that environment, into another folder."
 
 
 @dataclass(frozen=True, eq=False)
 class StoredShells:
-    """A stored run of shells as it answers for some ``traffic``, by the ``design``: its strata with their p there.
+    """A stored run of shells, and some ``traffic`` that it is to answer for.
 
-    It was ``tested`` in the traffic ``here`` with the ``pool`` of that; ``manifest`` and ``blocks`` are the run's.
+    It was run in the traffic ``here``, from its ``pool``, with the strata ``tested``; ``manifest`` and ``blocks`` are
+    the run's. ``design`` are the same strata with their probabilities in ``traffic``.
     """
 
     folder: Path
@@ -74,8 +76,9 @@ class StoredShells:
         manifest = read_manifest(folder)
         campaign = read_campaign(folder, manifest, check_files=True)
         if not campaign.sampling.strata or campaign.has_baseline_runs:
-            acts = "a vehicle that acts before the event: its events follow from its own runs"
-            found = acts if campaign.sampling.strata else f"tests by {campaign.testing.method}"
+            found = f"tests by {campaign.testing.method}"
+            if campaign.sampling.strata:
+                found = "a vehicle that acts before the event: its events follow from its own runs"
             expected = "tests of shells, of a vehicle that holds its speed until the event"
             raise CampaignError(option, found, expected, ELSEWHERE)
         here = resolve(campaign)
@@ -101,7 +104,7 @@ class StoredShells:
 
     @property
     def mean_share(self) -> float:
-        """Share of tests that crash, in the mean over what crashes add to the rate; 1 where nothing has crashed."""
+        """Share of tests that crash, averaged over what each stratum adds to the rate; 1 where nothing has crashed."""
         share, p = self.seen.tally.share, self.tested.p
         return float(p @ share**2 / (p @ share)) if share.any() else 1.0
 
@@ -111,12 +114,12 @@ class StoredShells:
         return self.mean_share >= LEAST_SHARE
 
     def rate(self, p: FloatArray) -> float:
-        """Crash rate where strata have probabilities (S,); its upper limit where no test crashed."""
+        """Crash rate where strata have probabilities ``p`` (S,); its upper limit where no test crashed."""
         tally = self.seen.tally
         return float(p @ tally.share) if tally.crashes.any() else self.limit(p)
 
     def limit(self, p: FloatArray, *, at_worst: bool = False) -> float:
-        """Upper limit of it; ``at_worst`` every event may crash of strata of which a few did."""
+        """Upper limit of the rate; ``at_worst`` counts all tests as crashes of strata where less than half crashed."""
         worst = self.seen.tally.failed_as_crashes()
         few = at_worst & (worst.crashes > 0) & (worst.crashes < LEAST_SHARE * worst.tests)
         crashes = np.where(few, worst.tests, worst.crashes)
@@ -128,7 +131,7 @@ class StoredShells:
         return self.design is self.tested
 
     def block(self, block: Block) -> Block:
-        """Tests as they count there: a path's probability of events is taken to change as that of all paths."""
+        """Tests with their weights in ``traffic``, where each path's events change as those of all paths together."""
         if self.is_same:
             return block
         old, new = self.tested.cell_p, self.design.cell_p
@@ -139,47 +142,51 @@ class StoredShells:
         return replace(block, columns=columns, drawn=replace(block.drawn, shells=self.design), log_weight=log_weight)
 
     def reference_error(self) -> float:
-        """By how much the rate of a reference driver comes out wrong at most, by its shares of strata."""
-        told, known = self.design.p @ reference_shares(self.tested), self.design.reference_rate
-        return float(np.max(np.abs(told[known > 0.0] / known[known > 0.0] - 1.0), initial=0.0))
+        """Largest relative error of a reference driver's rate, if that follows from its shares of the strata."""
+        by_shares, rate = self.design.p @ reference_shares(self.tested), self.design.reference_rate
+        return float(np.max(np.abs(by_shares[rate > 0.0] / rate[rate > 0.0] - 1.0), initial=0.0))
 
     def nearby(self, rows: Iterable[Mapping[str, float]], progress: Progress) -> Iterator[Nearby | None]:
-        """The same traffic with other numbers, by few paths; None where they give no laws.
+        """For each row of other numbers: the same traffic with these, by few paths; None where they give no laws.
 
-        Of a vehicle whose shares may change with it, the factor is that of its upper limit.
+        Of a vehicle whose shares may change with the traffic, the factor is that of its upper limit.
         """
-        traffic = [environment_with(self.traffic, row) for row in rows]
-        known = [each for each in traffic if each is not None]
-        progress.stage("other traffic", len(known))
+        environments = [environment_with(self.traffic, row) for row in rows]
+        valid = [environment for environment in environments if environment is not None]
+        progress.stage("other traffic", len(valid))
         p, shares = self.design.p, reference_shares(self.tested)
         paths = FewPaths(self.traffic, self.pool, self.tested, self.limit_mps2, progress)
-        (base,), found = paths.of([self.traffic.environment]), paths.of(known)
+        (base,), on_paths = paths.of([self.traffic.environment]), paths.of(valid)
         crash_share = self.seen.tally.share if self.seen.tally.crashes.any() else np.ones_like(p)
 
-        def moved(to: OnPaths) -> Nearby:
-            now, references = p * ratio_of(to.p, base.p), ratio_of(to.references, base.references)
-            crashing = now * crash_share
-            # Ends of a sample are not those of a law.
-            new = _share(to.beyond, to.p) - _share(base.beyond, base.p)
+        def moved(other: OnPaths) -> Nearby:
+            new_p = p * ratio_of(other.p, base.p)
+            references = ratio_of(other.references, base.references)
+            crashing = new_p * crash_share
+            # The pool's events are a sample: some of the same traffic lie beyond it, too, and do not count.
+            more_beyond = _share(other.beyond, other.p) - _share(base.beyond, base.p)
             with np.errstate(divide="ignore", over="ignore", invalid="ignore"):
-                off = np.expm1(np.abs(np.log(ratio_of(now @ shares, p @ shares) / references)))
-                beyond = float(crashing @ np.maximum(new, 0.0) / crashing.sum() + to.untested / to.p.sum())
-            rate = self.rate(now) / self.rate(p)
+                off = np.expm1(np.abs(np.log(ratio_of(new_p @ shares, p @ shares) / references)))
+                beyond = float(
+                    crashing @ np.maximum(more_beyond, 0.0) / crashing.sum() + other.untested / other.p.sum()
+                )
+            rate = self.rate(new_p) / self.rate(p)
             if not self.holds:
-                rate = self.limit(now, at_worst=True) / self.limit(p)
-            return Nearby(now, float(now.sum() / p.sum()), rate, references, float(np.max(off, initial=0.0)), beyond)
+                rate = self.limit(new_p, at_worst=True) / self.limit(p)
+            events = float(new_p.sum() / p.sum())
+            return Nearby(new_p, events, rate, references, float(np.max(off, initial=0.0)), beyond)
 
-        for each in traffic:
-            yield None if each is None else moved(next(found))
+        for environment in environments:
+            yield None if environment is None else moved(next(on_paths))
 
 
 @dataclass(frozen=True)
 class Nearby:
-    """Some traffic beside another: probabilities of the strata ``p`` (S,), and by what rates move from there to here.
+    """Traffic with other numbers: probabilities of the strata ``p`` (S,), and factors by which rates change with them.
 
-    ``rate`` is the vehicle's factor, ``references`` (R,) are those of the drivers, which are known, ``off`` by how much
-    one of these comes out too high or too low at most, and ``beyond`` the share of the crashes in events unlike any
-    tested. Events are ``events`` times as probable.
+    ``rate`` is the vehicle's factor; ``references`` (R,) are the drivers', as enumerated, and ``off`` is how far those
+    by their shares are off at most. ``beyond`` is the share of crashes in events unlike any tested. Events are
+    ``events`` times as probable.
     """
 
     p: FloatArray
@@ -191,33 +198,33 @@ class Nearby:
 
     @property
     def ratio(self) -> float:
-        """The factor of the ratio to the first reference driver."""
+        """Factor by which the vehicle's rate over the first reference driver's changes."""
         return self.rate / float(self.references[0]) if self.references[:1].any() else math.nan
 
     def per_event(self) -> Nearby:
-        """The same of rates per event, as where events per hour stay."""
+        """Factors of rates per event, for when the number of events per hour does not change."""
         return replace(self, rate=self.rate / self.events, references=self.references / self.events)
 
     @property
     def refused(self) -> bool:
-        """Whether the tests do not say it: nothing is said, either, of traffic in which a driver never crashes."""
+        """Whether the tests do not hold for it; NaN, as where a driver never crashes there, counts as that."""
         return not (self.off <= FAR_OFF and self.beyond <= MOST_BEYOND)
 
 
 def moved_to(tested: StoredShells, there: Resolved, name: str, progress: Progress) -> StoredShells:
-    """The strata with the probabilities of other traffic; refused where the tests say nothing of it."""
+    """The run as it answers for the traffic ``there``; a `CampaignError` where its tests say nothing of it."""
     if there.family.digest(there.environment) == tested.pool.environment:
         return replace(tested, traffic=there)
     was, now = ("take time" if each.scenario.shows else "are one step" for each in (tested.here, there))
-    if was != now:  # nobody sees those of one step beforehand: shells mean something else there
+    if was != now:  # nobody sees events of one step coming: surrogates, and so shells, are others
         expected = f"traffic as that of the tests, in which they {was}"
         raise CampaignError(OPTION, f"{name}, in which events {now}", expected, ELSEWHERE)
     require_shares(tested)
     progress.stage("pool of the other traffic", None)
-    elsewhere = campaign_pool(there, progress, order=tested.pool.names)
-    design = moved_design(tested.tested, design_shells(elsewhere, tested.limit_mps2), name)
+    pool = campaign_pool(there, progress, order=tested.pool.names)
+    design = moved_design(tested.tested, design_shells(pool, tested.limit_mps2), name)
     moved = replace(tested, traffic=there, design=design)
-    off, beyond = moved.reference_error(), _share_beyond(tested, elsewhere)
+    off, beyond = moved.reference_error(), _share_beyond(tested, pool)
     if beyond > MOST_BEYOND or off > MOST_OFF:
         found = f"traffic where {share(beyond)} of the crashes are in events unlike any that was tested"
         if beyond <= MOST_BEYOND:
@@ -242,20 +249,25 @@ def require_shares(tested: StoredShells) -> None:
 
 
 def moved_design(tested: ShellDesign, new: ShellDesign, environment: str) -> ShellDesign:
-    """The strata ``tested`` with the probabilities of a ``new`` design, by stratum and drivers; refused if unlike."""
-    places, unknown = _keys(tested), _keys(new)
-    p = np.zeros(len(places))
-    for (stratum, drivers), of_cell in zip(unknown, new.cell_p.tolist(), strict=True):
-        alike = [(s, r != drivers, i) for i, (s, r) in enumerate(places) if s == stratum]
+    """The strata ``tested`` with the probabilities of a ``new`` design, cell by cell.
+
+    A cell goes to one of the same stratum and reference drivers, else to the first of the stratum. Raises
+    `CampaignError`: a stratum was never tested.
+    """
+    cells = _cells(tested)
+    cell_p = np.zeros(len(cells))
+    for (stratum, drivers), p in zip(_cells(new), new.cell_p.tolist(), strict=True):
+        alike = [(r != drivers, cell) for cell, (s, r) in enumerate(cells) if s == stratum]
         if not alike:
-            found = f"{environment}, whose shell {stratum} was never tested (probability {of_cell:.3g})"
+            found = f"{environment}, whose shell {stratum} was never tested (probability {p:.3g})"
             raise CampaignError(OPTION, found, f"shells among {', '.join(tested.strata)}", ELSEWHERE)
-        p[min(alike)[2]] += of_cell
-    of_new = ("pool", "n_paths", "p_event", "p_unreachable", "reference_rate", "reference_square")
-    return replace(tested, cell_p=p, **{name: getattr(new, name) for name in of_new})
+        cell_p[min(alike)[1]] += p
+    names = ("pool", "n_paths", "p_event", "p_unreachable", "reference_rate", "reference_square")
+    return replace(tested, cell_p=cell_p, **{name: getattr(new, name) for name in names})
 
 
-def _keys(design: ShellDesign) -> list[tuple[str, int]]:
+def _cells(design: ShellDesign) -> list[tuple[str, int]]:
+    """Stratum's name and bits of the reference drivers that crash, of each cell."""
     names = [design.strata[s] for s in design.cell_stratum]
     return list(zip(names, design.cell_references, strict=True))
 
@@ -268,11 +280,11 @@ def reference_shares(design: ShellDesign) -> FloatArray:
 
 
 def _share_beyond(tested: StoredShells, new: Pool) -> float:
-    """Share of crashes in events whose initial state is beyond all those of the same shell that were there."""
-    design, old, weight = tested.design, tested.pool, tested.design.p * tested.seen.tally.share
-    outside = np.zeros(new.shell.size, np.bool_)
+    """Share of crashes in events of the ``new`` pool whose facts lie beyond all of the same shell in the tested one."""
+    old, outside = tested.pool, np.zeros(new.shell.size, np.bool_)
     for name, (low, high) in ranges(old).items():
         outside |= (new.events.facts[name] < low[new.shell]) | (new.events.facts[name] > high[new.shell])
     beyond = {name: float(outside[rows].mean()) for s, name in enumerate(old.names) if (rows := new.shell == s).any()}
-    shares: FloatArray = np.array([beyond.get(name, 0.0) for name in design.strata])
-    return float(weight @ shares / weight.sum()) if weight.any() else float(shares.max(initial=0.0))
+    shares: FloatArray = np.array([beyond.get(name, 0.0) for name in tested.design.strata])
+    crash_rate = tested.design.p * tested.seen.tally.share
+    return float(crash_rate @ shares / crash_rate.sum()) if crash_rate.any() else float(shares.max(initial=0.0))

@@ -1,4 +1,4 @@
-"""A run under way: rounds of tests, shards in order through the stop rule, then estimates and report."""
+"""A run under way: rounds of tests, their shards in order, the stop rule, then estimates and report."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ _EXIT_OF: Mapping[Verdict | PairVerdict, int] = {
 
 
 def exit_code(decision: Decision | PairDecision | None, *, missed: bool) -> int:
-    """By what was decided or, where no decision was asked for, by whether something else was ``missed``."""
+    """Of a command, by its decision; where none was asked for, by whether the asked precision was ``missed``."""
     return _EXIT_OF[decision.verdict] if decision else EXIT_BUDGET_SPENT if missed else EXIT_DONE
 
 
@@ -84,8 +84,8 @@ class Underway:
     run: kept.Run
     crew: Workers
     progress: Progress
-    whom: str = ""
-    """Which vehicle and scenario it is of, where there are others beside it."""
+    name: str = ""
+    """Of the vehicle and scenario, in errors, where other runs go on beside it."""
 
     @property
     def prescribed(self) -> PrescribedEpisodes:
@@ -94,20 +94,20 @@ class Underway:
         return self.run.source.prescribed
 
     def keep_design(self) -> None:
-        """Write the strata, without which nothing can be estimated, where the folder has no others."""
+        """Write the strata, which estimates need; refuse a folder whose strata are of another pool."""
         kept.require_same_pool(self.run.folder, self.run.source)
         if self.run.source.design is not None:
             write_sealed(self.run.folder / SHELLS, STORED_DESIGN.dump_python(self.run.source.design, mode="json"))
 
     def drive_before_tests(self) -> None:
-        """Drive the vehicle along paths without an event, if tests follow from some, and to a few that are too mild."""
+        """Drive milder events, where the family has some, and baseline runs, where tests follow from them."""
         self.keep_design()
         resolved, source = self.run.resolved, self.run.source
         left_open = assumed(resolved, source.pool, source.design, self.progress)
         self.run = self.run.noting(assumed=left_open, onset_step=resolved.family.first_onset(resolved.environment))
         if resolved.family.milder(resolved.environment) is not None:
-            driven = self._before(MILDER, paths.N_MILDER)
-            self.run = self.run.noting(milder=paths.milder_of(resolved, driven))
+            milder_tests = self._before(MILDER, paths.N_MILDER)
+            self.run = self.run.noting(milder=paths.milder_of(resolved, milder_tests))
         if (baseline := source.baseline_paths) is None:
             return
         table, runs = paths.begin(source, self._before)
@@ -116,8 +116,9 @@ class Underway:
         self.keep_design()
 
     def _before(self, name: str, n: int) -> pa.Table:
-        """What comes before tests that count, but for what an earlier run has done of it."""
-        what, causes = paths.IN_WORDS[name], Counter[str]()
+        """Run the ``n`` baseline runs or milder events, but those that an earlier run has left: all, as a table."""
+        what = paths.IN_WORDS[name]
+        causes = Counter[str]()
         self.progress.stage(f"{what}{self.crew.where}", n)
         stored = paths.stored_table(self.run.folder, self.run.parts_before, name)
         known = partial(paths.stored_baseline, stored, self.run.source.baseline_paths)
@@ -126,18 +127,19 @@ class Underway:
                 self.run = self.run.with_baseline(name, result)
             causes += result.failures
             self.progress.advance(result.request.n_episodes)
-        if name != MILDER:  # one of few that fails is told, as if it had crashed
-            campaign, table = self.run.resolved.campaign, f"the run folder's {name}/ table"
+        if name != MILDER:  # these are few: one that fails is reported as if it had crashed
+            campaign = self.run.resolved.campaign
+            table = f"the run folder's {name}/ table"
             again = f"`harness av-check VEHICLE --scenario {campaign.scenario}` drives it alone"
             kept.require_few_failed(causes, n, campaign, again, what, table)
         return pa.concat_tables(self.run.before[name])
 
     def drive_tests(self) -> Rule:
-        """Drive round after round until it is enough; returns the rule that says why."""
+        """Drive rounds of tests until the rule has enough; returns the rule, which knows why."""
         campaign, n_held = self.run.resolved.campaign, self.run.earlier.n_episodes
-        # Until a precision or a decision nobody knows how many.
-        most = campaign.stop.episodes if campaign.accept is None and campaign.stop.rhw is None else None
-        self.progress.stage(f"tests{self.crew.where}", most, done=n_held)
+        # A run to a precision or to a decision does not know its number of tests.
+        total = campaign.stop.episodes if campaign.accept is None and campaign.stop.rhw is None else None
+        self.progress.stage(f"tests{self.crew.where}", total, done=n_held)
         rounds = self.run.source.rounds(n_held)
         for shard in chain.from_iterable(self.drive(requests, rounds.rule) for requests in rounds):
             if rounds.enough(shard.block):
@@ -146,74 +148,75 @@ class Underway:
         return rounds.rule
 
     def drive(self, requests: Iterable[ShardRequest], rule: Rule) -> Iterator[ShardResult]:
-        """Shards in order, each part of the run by the time that it is handed out."""
-        with told_of(self.whom):
+        """Drive shards and yield them in order, each once it is added to the run."""
+        with told_of(self.name):
             for shard in self.crew.run(iter(requests), self.run.known):
                 with uninterrupted():
                     self.run = self.run.with_shard(shard)
                 self.run.require_few_failed(at_least=kept.SMALLEST_FAILED_SAMPLE)
                 n_new = max(self.run.n_episodes - self.run.earlier.n_episodes, 0)
                 counts = {"crashes": int(shard.block.crash.sum()), "failed": int(shard.block.failed.sum())}
-                told = {name: n for name, n in counts.items() if n or name == "crashes"}
-                self.progress.advance(min(n_new, shard.request.n_episodes), **told)
-                asked = None if self.run.resolved.campaign.accept else rule.target
-                self.progress.status(rhw=rule.look.rhw, asked=asked or math.inf)
+                shown = {name: n for name, n in counts.items() if n or name == "crashes"}
+                self.progress.advance(min(n_new, shard.request.n_episodes), **shown)
+                target = None if self.run.resolved.campaign.accept else rule.target
+                self.progress.status(rhw=rule.look.rhw, asked=target or math.inf)
                 yield shard
 
     def drive_added(self, tested: IntArray, added: IntArray, rule: Rule) -> Iterator[ShardResult]:
-        """The same of ``added`` tests per stratum, (S,), of which so many are ``tested``."""
-        run = self.run
-        places = len(run.blocks), run.n_episodes, run.resolved.campaign.run.smallest_shard
-        return self.drive(round_requests(tested, added, *places) if added.any() else (), rule)
+        """Drive ``added`` more tests per stratum, (S,), after the ``tested`` ones, (S,); yields their shards."""
+        if not added.any():
+            return self.drive((), rule)
+        run, smallest = self.run, self.run.resolved.campaign.run.smallest_shard
+        return self.drive(round_requests(tested, added, len(run.blocks), run.n_episodes, smallest), rule)
 
     def require_tests(self) -> None:
-        """Refuse a run of few tests that did not fail, without any, or of fewer than were there (`HarnessError`)."""
+        """Refuse (`HarnessError`) a run without tests, with too many that failed, or fewer than the folder had."""
         if not self.run.n_episodes:
             campaign = self.run.resolved.campaign
             found = f"{campaign.stop.episodes}, spent before a test of {campaign.scenario}"
             mend = "Raise it and go on with --resume, or lower testing.shells.first_tests."
             raise CampaignError("stop.episodes", found, "some tests of each scenario", mend)
-        with told_of(self.whom):
+        with told_of(self.name):
             self.run.require_few_failed()
             self.run.require_no_fewer()
 
     def doubtful(self) -> tuple[int, int]:
         """Numbers of tests that keep a limit from being accepted: ``n_milder`` and ``n_differing`` of a `Decision`."""
         run, campaign, counts = self.run, self.run.resolved.campaign, Counter[str]()
-        for each in run.blocks:
-            counts.update(each.acts())
-        n_early = sum(each.n_crashes_before_event(run.facts.get("onset_step")) for each in run.blocks)
+        for block in run.blocks:
+            counts.update(block.acts())
+        n_early = sum(block.n_crashes_before_event(run.facts.get("onset_step")) for block in run.blocks)
         n_milder = paths.n_left_out(campaign, n_early) + paths.beyond_scope(run.facts.get("milder"))
         n_milder += answer.n_softened(answer.before_event(campaign, run.facts, counts))
         return n_milder, len(run.repeated.differing) if run.repeated else 0
 
     def finish(self, rule: Rule, *, of_sum: bool = False) -> RunResult:
-        """Write manifest, estimates and report; ``of_sum`` the rule, and its decision, is about several scenarios."""
-        run, campaign, decided = self.run, self.run.resolved.campaign, dict[str, Any]()
+        """Write manifest, estimates and report; with ``of_sum`` rule and decision are of several scenarios together."""
+        run, campaign = self.run, self.run.resolved.campaign
         stopped_by: StoppedBy = "sum" if of_sum else answer.ended_by(campaign, rule, run.n_episodes)
         missed = campaign.stop.rhw is not None and stopped_by not in ("rhw", "below_reference", "sum")
+        ended: dict[str, Any] = {"stopped_by": stopped_by, "unmet": [asdict(each) for each in rule.look.unmet]}
         if (decision := None if of_sum else rule.look.decision) is not None:
             decision = doubted(decision, [self])
-            decided["decision"] = decision.to_json()
-        decided["expected"] = answer.expected_for(rule, campaign, run.n_episodes) if missed else None
-        decided["remedy"] = answer.pool_remedy(rule, campaign, stopped_by) or None
-        ended = {"stopped_by": stopped_by, "unmet": [asdict(each) for each in rule.look.unmet], **decided}
-        ended["wall_time_s"] = run.took_s  # told as it is written
+            ended["decision"] = decision.to_json()
+        ended["expected"] = answer.expected_for(rule, campaign, run.n_episodes) if missed else None
+        ended["remedy"] = answer.pool_remedy(rule, campaign, stopped_by) or None
+        ended["wall_time_s"] = run.took_s  # the same in the manifest and in what is shown
         run = run.written("done", **ended)
         self.progress.stage("writing estimates and report", None)
         manifest = run.content("done", **ended)
         estimates = answer.estimate_blocks(even(run.blocks), campaign, manifest)
         write_sealed(run.folder / ESTIMATES, estimates)
         tests, traffic = ShownTests.joined(run.shown, run.folder), run.resolved.environment
-        told = answer.STORED_ESTIMATES.validate_python(estimates)
-        shown = RunFolder(run.folder, campaign, manifest, told, run.source.design, tests, traffic)
+        validated = answer.STORED_ESTIMATES.validate_python(estimates)
+        shown = RunFolder(run.folder, campaign, manifest, validated, run.source.design, tests, traffic)
         code = exit_code(decision, missed=missed)
         return RunResult(run.folder, write_page_of(shown), estimates, stopped_by, code, shown)
 
 
 def doubted(decision: Decision, runs: Iterable[Underway]) -> Decision:
-    """The decision about these runs together, with what keeps it from being accepted."""
-    n_milder, n_differing = map(sum, zip(*(each.doubtful() for each in runs), strict=True))
+    """The decision about these runs together, with their numbers of tests that keep a limit from being accepted."""
+    n_milder, n_differing = map(sum, zip(*(run.doubtful() for run in runs), strict=True))
     return replace(decision, n_milder=n_milder, n_differing=n_differing)
 
 
@@ -223,18 +226,18 @@ Places = Mapping[Path, tuple[Resolved, dict[str, Any]]]
 
 @contextmanager
 def taken(folders: Mapping[Path, Resolved], *, resume: bool) -> Iterator[Places]:
-    """Keep other processes from the folders, all of which are looked at before one is touched."""
-    with ExitStack() as held:
+    """Lock the folders against other processes; all are checked before one is touched."""
+    with ExitStack() as locks:
         for folder in folders:
-            held.enter_context(sole_use(folder))
+            locks.enter_context(sole_use(folder))
         yield {folder: (own, kept.require_own_folder(folder, own, resume=resume)) for folder, own in folders.items()}
 
 
 @contextmanager
 def begun(places: Places, workers: int | None, progress: Progress) -> Iterator[list[Underway]]:
-    """Runs that begin in folders, or go on there, once what comes before their tests is driven.
+    """Runs that begin or go on in folders, with all that comes before their tests already driven.
 
-    The folders can be read wherever it is interrupted. Workers end with it; those of several runs take turns.
+    Wherever it is interrupted, the folders can be read. Workers end with it; those of several runs take turns.
     """
     n_scenarios = len({resolved.campaign.scenario for resolved, _ in places.values()})
     runs: list[Underway] = []
@@ -243,20 +246,21 @@ def begun(places: Places, workers: int | None, progress: Progress) -> Iterator[l
             for folder, (resolved, earlier) in places.items():
                 scenario = resolved.campaign.scenario if n_scenarios > 1 else ""
                 progress.remark = f" ({scenario.replace('_', ' ')})" if scenario else ""
-                whom = ", ".join(filter(None, (folder.name.upper() * (len(places) > n_scenarios), scenario)))
-                with told_of(whom):
+                name = ", ".join(filter(None, (folder.name.upper() * (len(places) > n_scenarios), scenario)))
+                with told_of(name):
                     crew = working.enter_context(closing(workers_of(resolved, workers, n_runs=len(places))))
                     began = time.monotonic()
                     remove_unfinished(folder.rglob(".*.part"))
                     source = prepare(resolved, progress)
                     run = kept.take_over(folder, resolved, source, earlier, began, workers=crew.n_workers)
-                    runs.append(Underway(run, crew, progress, whom))
+                    runs.append(Underway(run, crew, progress, name))
                     runs[-1].drive_before_tests()
             progress.remark = ""
             yield runs
         except BaseException:
-            for run in [each.run for each in runs if not each.run.is_behind]:  # else a file that no manifest lists
-                run.written("interrupted")
+            for underway in runs:
+                if not underway.run.is_behind:  # else it would write a file that no manifest lists
+                    underway.run.written("interrupted")
             raise
 
 
