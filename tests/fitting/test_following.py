@@ -107,6 +107,26 @@ def test_standard_errors_of_the_time_law_hold_the_truth():
     assert (np.abs(np.mean(held, axis=0) - 0.9) < 0.08).all()
 
 
+@pytest.mark.parametrize(("times", "most_off"), [("log-normal", 0.1), ("even", 0.3)])
+def test_early_cut_outs_are_as_frequent_as_counted_whatever_lies_beyond_the_last_time(
+    times, most_off, tmp_path, monkeypatch
+):
+    """Counted are some 70 % of all, or times of no log-normal law: in either case tests can be drawn from the file."""
+    monkeypatch.chdir(tmp_path)
+    random = np.random.default_rng(9)
+    ttc_s = 8.0 * np.exp(0.6 * random.standard_normal(1000)) if times == "log-normal" else 12.0 * random.random(800)
+    events = np.zeros((ttc_s < 12.0).sum(), OF_CUT_OUT)
+    events["ttc_s"], events["drop"], events["lateral_mps"] = ttc_s[ttc_s < 12.0], 0.1, np.nan
+    fitter, family = CutOutFitter(), family_named("cut_out")
+    fitter._seen = [Seen(100.0, events)]
+    ((file, content),) = fitter.fitted(SimpleNamespace(out=Path("mine.yaml"), provenance=list), {}).files.items()
+    file.write_bytes(content)
+    parameters = family.parameters(EnvironmentSettings(parameters=f"./{file}"))
+    grid, share = parameters.grid()
+    per_hour = parameters.exposure.per_hour.value * share[grid["ttc_s"] < 5.0].sum()
+    assert per_hour == pytest.approx((ttc_s < 5.0).sum() / 100.0, rel=most_off)
+
+
 def test_an_error_of_measurement_is_no_braking():
     steady = np.full(600, 32.0)
     spikes = led(steady)

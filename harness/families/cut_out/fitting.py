@@ -19,7 +19,12 @@ from harness.fitting.recording import Recording
 from harness.fitting.tracks import IN_VIEW_M, slope_weights
 from harness.vocabulary import FloatArray, IntArray, RecordArray
 
+SHIPPED = CUT_OUT.parameters(EnvironmentSettings()).values()
 STANDS_MPS = 0.5
+PRIOR_LOG_SD = 0.5
+"""How wide the prior of a time's median and log-sd is [assumed]."""
+BOUNDS = [(math.log(low), math.log(high)) for low, high in ((0.1, 60.0), (0.01, 3.0))]
+"""Of both, as files may have them."""
 LEAST_LATERAL_MPS = 0.1
 """Slower ones are wrong lateral positions, or a drift."""
 EVENT = np.dtype([("drop", np.float64), ("ttc_s", np.float64), ("lateral_mps", np.float64)])
@@ -43,10 +48,14 @@ class CutOutFitter(FollowingFitter):
         events["lateral_mps"] = np.abs(lateral_speeds(track, row))
         return Seen(hours, events[(closing > 0.0) & (gap > 0.0) & (events["ttc_s"] <= TTC_EDGES_S[-1])])
 
+    def share_counted(self, numbers: Numbers) -> float:
+        fitted = {f"leaving__{name}": each["value"] for name, each in numbers.get("leaving", {}).items()}
+        of = SHIPPED | fitted
+        return share_within(*(of[f"leaving__{name}"] for name in ("ttc_median_s", "ttc_log_sd", "careless_share")))
+
     def numbers(self, events: RecordArray) -> Numbers:
-        base = CUT_OUT.parameters(EnvironmentSettings()).values()
         drops = events["drop"][events["drop"] < 1.0 - STANDS_MPS / 30.0]
-        careless = [base[f"leaving__careless_{name}"] for name in ("share", "least_s", "most_s")]
+        careless = [SHIPPED[f"leaving__careless_{name}"] for name in ("share", "least_s", "most_s")]
         (median, log_sd), errors = time_law(events["ttc_s"], *careless)
         found = {"drop_mean": fitted_number(drops.mean(), drops.mean() / math.sqrt(drops.size))}
         found |= {"ttc_median_s": fitted_number(median, errors[0]), "ttc_log_sd": fitted_number(log_sd, errors[1])}
@@ -67,22 +76,31 @@ def lateral_speeds(track: Recording, rows: IntArray) -> FloatArray:
     return np.where(known, track.lateral[inside] @ weights, np.nan)
 
 
+def share_within(median_s: float, log_sd: float, careless: float) -> float:
+    """Share of all times to collision that is counted: up to the law's last edge."""
+    upto = float(special.ndtr((math.log(TTC_EDGES_S[-1]) - math.log(median_s)) / log_sd))
+    return (1.0 - careless) * upto + careless
+
+
 def time_law(ttc_s: FloatArray, share: float, least_s: float, most_s: float) -> tuple[FloatArray, FloatArray]:
     """Median and log-sd of times to collision (k,) up to the law's last edge, and their standard errors.
 
-    Log-normal, but for a ``share`` of careless drivers between two times, who are too few to be fitted.
+    Log-normal, but for a ``share`` of careless drivers between two times, who are too few to be fitted. Where times go
+    on evenly up to the last edge, how long those beyond are says a prior alone, about the shipped law.
     """
-    log_t, last = np.log(ttc_s), math.log(TTC_EDGES_S[-1])
+    log_t, shipped = np.log(ttc_s), np.log([SHIPPED["leaving__ttc_median_s"], SHIPPED["leaving__ttc_log_sd"]])
     careless = share / (most_s - least_s) * ((ttc_s >= least_s) & (ttc_s <= most_s))
 
     def loss(theta: FloatArray) -> float:
         log_sd = math.exp(theta[1])
         z = (log_t - theta[0]) / log_sd
         density = np.exp(-0.5 * z * z - log_t) / (log_sd * math.sqrt(2.0 * math.pi))
-        seen = special.ndtr((last - theta[0]) / log_sd)
-        return -float(np.log((1.0 - share) * density / seen + careless + 1e-300).sum())
+        likelihood = ((1.0 - share) * density + careless) / share_within(math.exp(theta[0]), log_sd, share)
+        away = (theta - shipped) / PRIOR_LOG_SD
+        return -float(np.log(likelihood + 1e-300).sum()) + 0.5 * float(away @ away)
 
-    found = optimize.minimize(loss, [log_t.mean(), math.log(log_t.std() + 1e-3)], method="Nelder-Mead").x
+    start = [log_t.mean(), math.log(log_t.std() + 1e-2)]
+    found = optimize.minimize(loss, start, method="Nelder-Mead", bounds=BOUNDS).x
     steps = 1e-3 * np.eye(2)
     bend = [[sum(a * b * loss(found + a * i + b * j) for a in (-1, 1) for b in (-1, 1)) for j in steps] for i in steps]
     errors = np.sqrt(np.diag(np.linalg.inv(np.array(bend) / 4e-6)))

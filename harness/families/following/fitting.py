@@ -87,6 +87,10 @@ class FollowingFitter:
         """Fitted numbers by section and name, from at least `FEWEST_OF_LAW` events."""
         raise NotImplementedError
 
+    def share_counted(self, numbers: Numbers) -> float:
+        """Share of the events of its law, with fitted ``numbers`` if there are any, that are counted: here all."""
+        return 1.0
+
     def marks(self, out: Path) -> dict[Path, bytes]:
         return {out.with_name(f"{out.stem}.{self.family.name}.yaml"): OF_YAML}
 
@@ -97,9 +101,9 @@ class FollowingFitter:
         base = self.family.default_parameters
         hours = math.fsum(each.hours for each in self._seen)
         events = np.concatenate([each.events for each in self._seen])
-        content, told = self._exposure(events.size, hours)
-        if events.size >= FEWEST_OF_LAW:
-            law = self.numbers(events)
+        law = self.numbers(events) if events.size >= FEWEST_OF_LAW else {}
+        content, told = self._exposure(events.size, hours, self.share_counted(law))
+        if law:
             content |= law
             of = [(name, each) for own in law.values() for name, each in own.items()]
             told += "; " + ", ".join(f"{name} {number(each['value'])} ± {number(each['se'], 2)}" for name, each in of)
@@ -114,17 +118,19 @@ class FollowingFitter:
         facts = {self.family.name: {"events": events.size, "hours": hours, **content}}
         return Fitted({file: text.encode()}, (told, *more), facts)
 
-    def _exposure(self, n: int, hours: float) -> tuple[Numbers, str]:
-        """The rate of n events, where they are enough, and in words."""
+    def _exposure(self, n: int, hours: float, share: float) -> tuple[Numbers, str]:
+        """The rate of n events, where they are enough, and in words; counted are a ``share`` of all."""
         kept = self.family.parameters(EnvironmentSettings()).exposure.per_hour
         told = f"{self.family.name}: {n:,} {self.events} in {number(hours)} h of following"
-        low, high = (float(f"{end / max(hours, 1e-9):.4g}") for end in garwood(n, TAIL))
+        of_all = hours * share
+        low, high = (float(f"{end / max(of_all, 1e-9):.4g}") for end in garwood(n, TAIL))
         limits = f"{number(low, 2)} to {number(high, 2)}"
         if n >= FEWEST_COUNTED:
-            note = f"{n} in {hours:.4g} h of following"
-            rate = {**fitted_number(n / hours, math.sqrt(n) / hours), "range": [low, high], "note": note}
-            counted = {"exposure": {"per_hour": rate, "events": n, "hours": round(hours, 6)}}
-            return counted, f"{told}, {number(n / hours)} per hour ({limits})"
+            part = f", {share:.3g} of all by the law" * (share < 1.0)
+            note = f"{n} in {hours:.4g} h of following{part}"
+            rate = {**fitted_number(n / of_all, math.sqrt(n) / of_all), "range": [low, high], "note": note}
+            counted = {"exposure": {"per_hour": rate, "events": n, "hours": round(of_all, 6)}}
+            return counted, f"{told}{part}: {number(n / of_all)} per hour ({limits})"
         needed = f", some {number(hours * FEWEST_COUNTED / n, 2)} h" if n else ""
         outside = not low <= kept.value <= high
         seen = {"note": f"{kept.note or kept.source}; {EXCLUDED}: {n} in {hours:.4g} h of following"}
