@@ -1,11 +1,11 @@
 """Paths of a pool, enumerated where crashes are, by importance sampling in the uniforms that they begin with.
 
 Events next to each other mostly end alike. So of each path only every ``stride``-th is asked, from a random one on, and
-counts for the ones around it: that keeps every sum over events unbiased, and with the same time for more paths the
-crash rates become known about three times sooner.
+counts for the ones around it. Every sum over events stays unbiased, and as the time saved goes into more paths, crash
+rates become known about three times sooner.
 
 Each uniform gets a piecewise constant density of its own, fitted to a pilot run, as in Lepage's VEGAS (J. Comput.
-Phys. 27, 1978, 192), mixed with a share of the naturalistic density that bounds every weight.
+Phys. 27, 1978, 192). It is mixed with a share of the naturalistic density, which bounds every weight.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ PILOT_PATHS = 2048
 BLOCK_PATHS = 256
 N_BINS = 16
 NATURALISTIC_SHARE = 0.2
-"""Weights are at most its inverse."""
+"""Share of the naturalistic density in the mixture: weights are at most its inverse."""
 AIMED_DRAW, OFFSET_DRAW = 0, 1
 """Draws of a path within the diagnostic stream."""
 
@@ -34,9 +34,9 @@ AIMED_DRAW, OFFSET_DRAW = 0, 1
 def aimed_points(density: FloatArray, u: FloatArray, choice: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Points (n, dimensions) drawn from a proposal, and their weights (n,): naturalistic density over the proposal's.
 
-    The proposal is a product ``density`` (dimensions, N_BINS) on the unit cube, that within each bin with mean 1, mixed
-    with the uniform one: ``choice`` (n,) are the uniforms that decide which points stay naturalistic. ``u``
-    (n, dimensions) are those that become points.
+    The proposal is the product of one piecewise constant ``density`` (dimensions, N_BINS), of mean 1, per dimension of
+    the unit cube, mixed with the uniform one. The uniforms ``choice`` (n,) decide which points stay naturalistic; the
+    uniforms ``u`` (n, dimensions) become the points.
     """
     edges = np.linspace(0.0, 1.0, N_BINS + 1)
     aimed = choice >= NATURALISTIC_SHARE
@@ -58,9 +58,9 @@ def weights_under(density: FloatArray, points: FloatArray) -> FloatArray:
 
 
 def fit_proposal(u: FloatArray, contribution: FloatArray) -> FloatArray:
-    """Density of a proposal from the uniforms (n, dimensions) of a naturalistic pilot run, and each one's part (n,).
+    """Density of a proposal, from a naturalistic pilot run's uniforms (n, dimensions) and contributions (n,).
 
-    The best density of one variable is the root of the contribution's mean square within each bin.
+    The best density of one variable is the root of the contributions' mean square within each bin.
     """
     density = np.ones((u.shape[1], N_BINS))
     for d in range(u.shape[1]):
@@ -85,8 +85,8 @@ def contributions(rates: FloatArray, share: FloatArray | float = 1.0) -> FloatAr
     """
     mean = rates.mean(0)
     relative = rates / np.where(mean > 0.0, mean, 1.0)
-    found: FloatArray = np.sqrt((relative * relative * share).sum(1))
-    return found
+    total: FloatArray = np.sqrt((relative * relative * share).sum(1))
+    return total
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,8 +94,8 @@ class EnumeratedPaths:
     """How some paths (n,) begin, and their events.
 
     ``index`` (n,) are their numbers, ``weight`` (n,) the naturalistic over the proposal's density. ``mass`` (n, E) is
-    the probability of the events that one stands for, times the weight; ``crashes`` (n, E) has one bit per surrogate,
-    as the library orders them.
+    the weight times the probability of the events that this one stands for; ``crashes`` (n, E) has a bit per surrogate
+    and reference, in the library's order.
     """
 
     index: IntArray
@@ -105,12 +105,12 @@ class EnumeratedPaths:
     crashes: IntArray
 
     def rates(self, n_surrogates: int) -> FloatArray:
-        """Per path: its weighted probability that each surrogate crashes, and of an event; shape (n, D + 1)."""
+        """Weighted probability on each path that each surrogate crashes, and of an event; shape (n, D + 1)."""
 
-        def of(d: int) -> FloatArray:
-            return np.asarray(np.where(self.crashes & (1 << d), self.mass, 0.0).sum(1))
+        def rate(surrogate: int) -> FloatArray:
+            return np.asarray(np.where(self.crashes & (1 << surrogate), self.mass, 0.0).sum(1))
 
-        return np.column_stack([*made_ahead(of, range(n_surrogates)), self.mass.sum(1)])
+        return np.column_stack([*made_ahead(rate, range(n_surrogates)), self.mass.sum(1)])
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,12 +126,11 @@ class Enumerator:
     """None: the family's."""
 
     def __post_init__(self) -> None:
-        # Compiled here, by one thread: of two that want a new kernel at once, the second would have to wait for
-        # whatever else is compiled meanwhile.
+        # Compiles the kernel in one thread: of two that need it at once, the second would wait for all compilations.
         self._block(0, 0)
 
     def aimed(self, rates: FloatArray, share: FloatArray | float = 1.0) -> Enumerator:
-        """The same, aimed at what contributes to the rates (n, columns) of its first paths; see `contributions`."""
+        """The same, aimed at paths like those of its first n that contribute to the ``rates`` (n, columns)."""
         proposal = fit_proposal(self.uniforms(0, len(rates)), contributions(rates, share))
         return replace(self, proposal=proposal)
 
@@ -153,10 +152,11 @@ class Enumerator:
 
     def _block(self, first: int, n: int = BLOCK_PATHS) -> EnumeratedPaths:
         u, weight = self.uniforms(first, n), np.ones(n)
-        drawn, stride = uniforms(self.seed, first, n, DIAGNOSTIC, 2), self.stride or self.family.stride
-        offset = (drawn[:, OFFSET_DRAW] * stride).astype(np.int64)
+        draws = uniforms(self.seed, first, n, DIAGNOSTIC, 2)
+        stride = self.stride or self.family.stride
+        offset = (draws[:, OFFSET_DRAW] * stride).astype(np.int64)
         if self.proposal is not None:
-            u, weight = aimed_points(self.proposal, u, drawn[:, AIMED_DRAW])
+            u, weight = aimed_points(self.proposal, u, draws[:, AIMED_DRAW])
         paths = Paths(first + np.arange(n), self.family.start(self.environment, u))
-        found = self.family.events(self.environment, self.seed, paths, self.followers, stride=stride, offset=offset)
-        return EnumeratedPaths(*paths, weight, found.probability * weight[:, None], found.crashes)
+        events = self.family.events(self.environment, self.seed, paths, self.followers, stride=stride, offset=offset)
+        return EnumeratedPaths(*paths, weight, events.probability * weight[:, None], events.crashes)

@@ -32,7 +32,7 @@ from harness.vocabulary import BoolArray, FloatArray, Int8Array, IntArray
 ROUND_PATHS = 1024
 MOST_PATHS = 1 << 20
 AGGRESSIVE_SHARE = 0.2
-"""How much the surrogates beyond the boundary count in aiming, and those far off: less has to be known there."""
+"""How much the surrogates beyond the boundary, and those far off, count in aiming: less has to be known of them."""
 AGGRESSIVE_ERROR = 4.0
 """Their relative error may be this many times the target."""
 FAR_OFF = 10.0
@@ -41,13 +41,13 @@ own, which few paths meet: paths aimed there would be lost for all others."""
 POOL_SEED = 0x706F6F6C
 """Keeps a pool's random numbers apart from those of a campaign with the same seed."""
 KEEP_DRAW = 1
-"""Draw of a shell within the diagnostic stream."""
+"""Draw within the diagnostic stream by which a shell's sample of events is chosen."""
 _MADE_BY = ("aim.py", "build.py", "shells.py")
 """Code that decides what is in a pool, beside the kernels."""
 
 
 def campaign_pool_key(resolved: Resolved, order: Sequence[str] = ()) -> str:
-    """Hash of all that a pool depends on: environment, lane changing, library, settings, code, and a given order."""
+    """Hash of all that a pool depends on: environment, lane changing, library, settings, code, and ``order``."""
     library = resolved.library
     content = [
         FORMAT,
@@ -65,14 +65,14 @@ def campaign_pool_key(resolved: Resolved, order: Sequence[str] = ()) -> str:
 
 
 def pool_name(key: str) -> str:
-    """What a pool is kept under."""
+    """Name of a pool's file in the cache."""
     return f"pools/{key}"
 
 
 def campaign_pool(resolved: Resolved, progress: Progress | None = None, order: Sequence[str] = ()) -> Pool:
     """The pool of a campaign's environment and library, from the cache or built and cached.
 
-    Surrogates are in the ``order`` of their rates, or of those in other traffic.
+    Surrogates are in the ``order`` of these names, by default the most conservative first.
     """
     key = campaign_pool_key(resolved, order)
     if (cached := cached_pool(resolved, order)) is not None:
@@ -109,7 +109,7 @@ def build_pool(resolved: Resolved, key: str, progress: Progress | None = None, o
 
 @dataclass(frozen=True, eq=False)
 class Aim:
-    """Paths aimed at crashes, what the pilot run said (n, D + 1), and which of its columns are to be known well."""
+    """Paths aimed at crashes; the ``pilot`` run's rates (n, D + 1), and which of its columns are to be known well."""
 
     enumerator: Enumerator
     pilot: FloatArray
@@ -122,40 +122,40 @@ class Aim:
 
 
 def take_aim(resolved: Resolved, progress: Progress) -> Aim:
-    """Find out by a pilot run of naturalistic paths where surrogates crash."""
+    """Aim paths at where surrogates crash, by a pilot run of naturalistic paths."""
     family, environment, library = resolved.family, resolved.environment, resolved.library
     followers = library.followers(family.shows(environment))
     pilot = Enumerator(family, environment, followers, resolved.campaign.pool.seed ^ POOL_SEED)
     progress.stage("pool: pilot", PILOT_PATHS)
     rates = pilot.run(0, PILOT_PATHS, progress).rates(len(library.surrogates))
     mean, boundary = rates.mean(0), list(library.surrogates).index(library.boundary)
-    seen = mean > 0.0  # one that no path has met yet is met by few
-    relvar = np.where(seen, rates.var(0) / np.where(seen, mean, 1.0) ** 2, np.inf)
+    crashes = mean > 0.0  # a surrogate that no pilot path makes crash needs many paths: it is not to be known well
+    relvar = np.where(crashes, rates.var(0) / np.where(crashes, mean, 1.0) ** 2, np.inf)
     # To be known well are those no more aggressive than the boundary, if they crash in the traffic that it crashes in.
     aim = Aim(pilot, rates, (mean <= mean[boundary]) & (relvar <= FAR_OFF * relvar[boundary]))
     return replace(aim, enumerator=pilot.aimed(rates, aim.share))
 
 
 def planned_number(aim: Aim, error: float) -> int:
-    """How many aimed paths a relative error needs by the pilot run; what is left of it is part of every interval.
+    """How many aimed paths a relative error of the rates needs, by the pilot run; that error is part of every interval.
 
     Were paths added until their own errors look small, the rate of a surrogate that few of them meet would come out too
-    low (docs/internals/performance.md). The pilot's paths are none of them; each counts by the weight that it has under
-    the proposal.
+    low (docs/internals/performance.md). The pilot's paths are not used again: here each counts by the weight that it
+    would have under the proposal.
     """
     rates, weight = aim.pilot, aim.enumerator.weights(0, len(aim.pilot))
     mean = rates.mean(0)
-    seen = mean > 0.0
-    relvar = (rates * rates * weight[:, None]).mean(0)[seen] / mean[seen] ** 2 - 1.0
-    wanted = error * np.where(aim.conservative, 1.0, AGGRESSIVE_ERROR)[seen]
+    crashes = mean > 0.0
+    relvar = (rates * rates * weight[:, None]).mean(0)[crashes] / mean[crashes] ** 2 - 1.0
+    wanted = error * np.where(aim.conservative, 1.0, AGGRESSIVE_ERROR)[crashes]
     rounds = np.ceil(np.max(relvar / wanted**2, initial=1.0) / ROUND_PATHS)
     return ROUND_PATHS * min(int(rounds), MOST_PATHS // ROUND_PATHS)
 
 
 def pool_of(resolved: Resolved, paths: EnumeratedPaths, key: str, order: IntArray | None = None) -> Pool:
-    """Sort the events of paths into shells, by surrogates in this order, and cells; keep a sample of each shell.
+    """Sort the events of paths into shells and cells; keep a sample of each shell.
 
-    Without an order surrogates are put into that of their rates.
+    ``order`` (D,) are the surrogates as places in the library, by default `conservative_first` of these paths.
     """
     family, environment, library = resolved.family, resolved.environment, resolved.library
     settings = resolved.campaign.pool
@@ -164,17 +164,19 @@ def pool_of(resolved: Resolved, paths: EnumeratedPaths, key: str, order: IntArra
     rates, mass = paths.rates(n_surrogates), paths.mass
     order = conservative_first(rates) if order is None else order
     n, ordered = len(rates), rates[:, order]
+
     shell, references = shells_of(paths.crashes, order), paths.crashes >> n_surrogates
     cell, cell_shell, cell_references, by_path = cells_of(mass, shell, references, n_references)
     by_reference = by_path @ ((cell_references[:, None] >> np.arange(n_references)) & 1)
+
     n_within = list(names[order]).index(library.boundary) + 1
     times = np.where(np.arange(n_surrogates + 1) < n_within, 1, family.outside_kept)
-    path, step = _keep(mass, shell, (settings.events_per_shell * times).tolist(), settings.seed)
+    path, step = _sample(mass, shell, (settings.events_per_shell * times).tolist(), settings.seed)
     chosen = family.choose(environment, settings.seed ^ POOL_SEED, Paths(paths.index[path], paths.start[path]), step)
-    asked = np.concatenate([order, n_surrogates + np.arange(n_references)])
-    crashes = ((paths.crashes[path, step][:, None] >> asked[None, :]) & 1).astype(np.bool_)
-    mass_kept = by_path[path].astype(np.float32)
-    sample = KeptEvents(PILOT_PATHS + path, step, cell[path, step], *chosen, crashes, mass_kept)
+    bits = np.concatenate([order, n_surrogates + np.arange(n_references)])
+    crashes = ((paths.crashes[path, step][:, None] >> bits[None, :]) & 1).astype(np.bool_)
+    path_mass = by_path[path].astype(np.float32)
+    events = KeptEvents(PILOT_PATHS + path, step, cell[path, step], *chosen, crashes, path_mass)
     return Pool(
         key=key,
         family=family.name,
@@ -191,24 +193,24 @@ def pool_of(resolved: Resolved, paths: EnumeratedPaths, key: str, order: IntArra
         cell_p=by_path.mean(0),
         reference_rate=by_reference.mean(0),
         reference_square=(by_reference * by_reference).mean(0),
-        events=sample,
+        events=events,
     )
 
 
-def _keep(mass: FloatArray, shell: Int8Array, n_kept: Sequence[int], seed: int) -> tuple[IntArray, IntArray]:
-    """Systematic sample of so many events of every shell, with probability proportional to mass.
+def _sample(mass: FloatArray, shell: Int8Array, n_each: Sequence[int], seed: int) -> tuple[IntArray, IntArray]:
+    """Systematic sample of ``n_each`` (D + 1) events of the shells, with probability proportional to mass (n, E).
 
-    Path and step (row and column in ``mass``), each (n,), sorted by shell and path.
+    Returns path and step (row and column in ``mass``) of each, sorted by shell and path.
     """
-    kept = []
-    for s, n in enumerate(n_kept):
+    samples = []
+    for s, n in enumerate(n_each):
         places = np.flatnonzero((shell == s) & (mass > 0.0))
         if places.size == 0:
             continue
         cumulative = np.cumsum(mass.ravel()[places])
         offset = uniforms(seed, s, 1, DIAGNOSTIC, KEEP_DRAW + 1)[0, KEEP_DRAW]
-        wanted = (offset + np.arange(n)) * (cumulative[-1] / n)
-        chosen = places[np.minimum(np.searchsorted(cumulative, wanted, side="right"), places.size - 1)]
-        kept.append((chosen // mass.shape[1], chosen % mass.shape[1]))
-    path, step = (np.concatenate(column) for column in zip(*kept, strict=True))
+        levels = (offset + np.arange(n)) * (cumulative[-1] / n)
+        chosen = places[np.minimum(np.searchsorted(cumulative, levels, side="right"), places.size - 1)]
+        samples.append((chosen // mass.shape[1], chosen % mass.shape[1]))
+    path, step = (np.concatenate(column) for column in zip(*samples, strict=True))
     return path, step

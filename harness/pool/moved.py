@@ -1,8 +1,8 @@
-"""What few paths say of other traffic: how probable the strata are there, and how often reference drivers crash.
+"""Other traffic by few paths: how probable the strata are there, and how often reference drivers crash.
 
-The same paths, by their random numbers, are walked in every traffic, so that ratios are known far better than what they
-are of: a rate of cut-ins moves by the same some 0.2 % with 4,096 paths, of which it is known to 3 %. Paths of
-lead braking and cut-outs take 2 to 8 times as long: with a quarter as many a rate moves by the same to 4 % or better.
+Paths with the same random numbers are walked in every traffic, so that ratios between traffic are known far better than
+the rates: with 4,096 paths, to some 0.2 % where a rate of cut-ins is known to 3 %. Paths of lead braking and cut-outs
+take 2 to 8 times as long: with a quarter as many, ratios are known to 4 % or better.
 """
 
 from __future__ import annotations
@@ -29,16 +29,16 @@ from harness.vocabulary import FloatArray
 
 N_PATHS, N_PATHS_OF_FOLLOWERS = 4096, 1024
 FORMAT = 3
-"""Raise it when the meaning of what is kept changes."""
+"""Raise it when the meaning of the cached files changes."""
 MARGIN = 0.05
-"""Of the range of a sample of events, by which another may lie beyond it [assumed]."""
+"""Share of the range of a sample of events, by which an event beyond it is still like these [assumed]."""
 
 
 class OnPaths(NamedTuple):
-    """Of some traffic: probability per test of events of each stratum ``p`` (S,), and rates of reference drivers (R,).
+    """Some traffic: probability per test of events of each stratum ``p`` (S,), and rates of reference drivers (R,).
 
-    ``beyond`` (S,) is the part of ``p`` in events whose initial state is beyond all those of the same shell in the
-    tested pool; ``untested`` () the probability of shells that the tested pool does not have.
+    ``beyond`` (S,) is the part of ``p`` in events whose initial state lies beyond all of the same shell in the tested
+    pool; ``untested`` () is the probability of shells that the tested pool does not have.
     """
 
     p: FloatArray
@@ -50,7 +50,7 @@ class OnPaths(NamedTuple):
 class FewPaths:
     """Walks the same few paths, aimed by the traffic ``resolved``, in one traffic after the other.
 
-    Strata are those of a ``design`` that was made of the ``pool``. What was found is kept in the cache.
+    Strata are those of a ``design`` that was made of the ``pool``. Results are kept in the cache.
     """
 
     def __init__(
@@ -65,24 +65,24 @@ class FewPaths:
         self._range = ranges(pool)
         self._aimed: Enumerator | None = None
         self._n = n = N_PATHS_OF_FOLLOWERS if resolved.family.follows else N_PATHS
-        about = FORMAT, pool.key, resolved.family.digest(resolved.environment), design.strata, settings.seed, n
-        key = hashlib.sha256(json.dumps(about).encode()).hexdigest()[:24]
+        inputs = FORMAT, pool.key, resolved.family.digest(resolved.environment), design.strata, settings.seed, n
+        key = hashlib.sha256(json.dumps(inputs).encode()).hexdigest()[:24]
         self._name = f"moved/{key}"
-        kept: dict[str, list[Any]] = json.loads(cache.read(self._name) or "{}")
-        self._seen = {key: OnPaths(*map(np.array, row)) for key, row in kept.items()}
+        cached: dict[str, list[Any]] = json.loads(cache.read(self._name) or "{}")
+        self._walked = {digest: OnPaths(*map(np.array, columns)) for digest, columns in cached.items()}
 
     def of(self, environments: Sequence[Environment]) -> Iterator[OnPaths]:
-        """What is found in each."""
-        n_kept = len(self._seen)
+        """Each environment's probabilities and rates, from the cache or walked."""
+        n_cached = len(self._walked)
         try:
             for environment in environments:
-                if (key := self._resolved.family.digest(environment)) not in self._seen:
-                    self._seen[key] = self._walk(environment)
-                yield self._seen[key]
+                if (digest := self._resolved.family.digest(environment)) not in self._walked:
+                    self._walked[digest] = self._walk(environment)
+                yield self._walked[digest]
                 self._progress.advance(1)
         finally:
-            if len(self._seen) > n_kept:
-                content = {key: [of.tolist() for of in each] for key, each in self._seen.items()}
+            if len(self._walked) > n_cached:
+                content = {digest: [column.tolist() for column in each] for digest, each in self._walked.items()}
                 cache.keep(self._name, json.dumps(content).encode())
 
     def _walk(self, environment: Environment) -> OnPaths:
@@ -94,7 +94,7 @@ class FewPaths:
         flat = np.arange(n)[:, None] * n_shells + shell
         by_path = np.bincount(flat.ravel(), mass.ravel(), n * n_shells).reshape(n, n_shells)
         outside = np.zeros((n, n_shells), np.bool_)
-        for name in {*self._range} & {*(paths.start.dtype.names or ())}:  # a fact may be of the event alone
+        for name in {*self._range} & {*(paths.start.dtype.names or ())}:  # other facts are of the event, not the start
             (low, high), state = self._range[name], paths.start[name][:, None]
             outside |= (state < low) | (state > high)
         rate = [np.where((paths.crashes >> bit) & 1 == 1, mass, 0.0).sum() for bit in self._references]
@@ -106,22 +106,21 @@ class FewPaths:
 
 
 def ranges(pool: Pool) -> dict[str, tuple[FloatArray, FloatArray]]:
-    """Where the numbers of the initial states of the pool's events lie, by shell (D + 1,), with a margin.
+    """Lowest and highest value of each numerical fact of the pool's events, by shell (D + 1,), with a margin.
 
     An event a little beyond the outermost of a sample is not unlike those in it.
     """
-    shell, n = pool.shell, len(pool.names) + 1
-    found = {}
-    numbers = [each.name for each in family_named(pool.family).columns if pa.types.is_floating(each.kind)]
-    for name in numbers:
-        low, high = np.full(n, -np.inf), np.full(n, np.inf)  # of a shell without events nothing is known
+    shell, n_shells = pool.shell, len(pool.names) + 1
+    limits = {}
+    for name in [column.name for column in family_named(pool.family).columns if pa.types.is_floating(column.kind)]:
+        low, high = np.full(n_shells, -np.inf), np.full(n_shells, np.inf)  # unlimited for a shell without events
         for s in np.unique(shell):
             values = pool.events.facts[name][shell == s]
             low[s], high[s] = values.min(), values.max()
             margin = MARGIN * (high[s] - low[s])
             low[s], high[s] = low[s] - margin, high[s] + margin
-        found[name] = low, high
-    return found
+        limits[name] = low, high
+    return limits
 
 
 def environment_with(there: Resolved, values: Mapping[str, float]) -> Environment | None:
@@ -132,25 +131,25 @@ def environment_with(there: Resolved, values: Mapping[str, float]) -> Environmen
 def assumed(
     traffic: Resolved, pool: Pool | None, design: ShellDesign | None, progress: Progress
 ) -> dict[str, Any] | None:
-    """Fields of `Assumed`: by what the strata's probabilities move over what data leave open; None without that.
+    """Fields of `Assumed`: factors of the strata's probabilities over what data leave open; None without that.
 
-    That is the range that is stated for who does not look, or shares of lane changes at times to collision where none
-    was seen, which are anything up to what that many vehicles without one refuse. Without strata of this traffic there
-    are no factors.
+    Left open is the range that is stated for drivers who do not look, or the shares of lane changes at times to
+    collision at which none was seen: from none to the most that so many vehicles without one allow. Without strata of
+    this traffic there are no factors.
     """
     if pool is None or design is None:
         return asdict(Assumed(traffic.parameters.unseen)) if traffic.parameters.unseen else None
-    if (left := traffic.parameters.left_open()) is None:
+    if (left_open := traffic.parameters.left_open()) is None:
         return None
-    ends = [environment_with(traffic, each) for each in left.ends]
+    ends = [environment_with(traffic, numbers) for numbers in left_open.ends]
     if None in ends:
         return None
     paths = FewPaths(traffic, pool, design, tested_limit(traffic.campaign), progress)
-    base, *moved = paths.of([traffic.environment, *filter(None, ends)])
-    low, high = (tuple(ratio_of(each.p, base.p).tolist()) for each in moved)
-    return asdict(Assumed(left.where, left.highest, (low, high), left.share))
+    base, *at_ends = paths.of([traffic.environment, *filter(None, ends)])
+    low, high = (tuple(ratio_of(end.p, base.p).tolist()) for end in at_ends)
+    return asdict(Assumed(left_open.where, left_open.highest, (low, high), left_open.share))
 
 
 def ratio_of(a: FloatArray, b: FloatArray) -> FloatArray:
-    """1 where there is nothing to compare with."""
+    """Elementwise a / b; 1 where b is 0."""
     return np.divide(a, b, out=np.ones_like(b), where=b > 0.0)

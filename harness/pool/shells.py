@@ -1,11 +1,11 @@
-"""What a pool and its shells are, and shells as strata of a campaign: which events belong together, and the tests.
+"""What a pool and its shells are, the strata of a campaign that shells make up, and the tests drawn from them.
 
-Surrogates are in an order, the most conservative first, by their crash rates. An event belongs to the shell of the
-first of them that crashes on it, or to the last shell if none does. Cells divide shells by which references crash.
+Surrogates are ordered by their crash rates, the most conservative first. An event belongs to the shell of the first of
+them that crashes on it, or to the last shell if none does. Cells divide shells by which references crash.
 
-Shells up to the boundary are strata of their own. All beyond it is one stratum, *outside*: what a careful vehicle is
-tested for there is that nothing happens, and dividing a stratum without crashes only costs tests. A shell on which not
-even the full-throttle envelope crashes is left out, with crash probability 0, if the vehicle cannot accelerate harder.
+Each shell up to the boundary is a stratum. All shells beyond it are one stratum, *outside*: there tests show that a
+careful vehicle does not crash, and dividing a stratum without crashes only costs tests. The shell on which not even the
+full-throttle envelope crashes is left out, with crash probability 0, if the vehicle cannot accelerate harder.
 """
 
 from __future__ import annotations
@@ -35,14 +35,14 @@ from harness.vocabulary import BoolArray, Float32Array, FloatArray, Int8Array, I
 FORMAT = 10
 """Raise it when the meaning of a pool changes."""
 CANDIDATES = 32_768
-"""Paths of an AV that holds its speed, of which baseline runs are chosen: they cost milliseconds each, and save two of
-three runs."""
+"""Paths beside an AV that holds its speed, among which those of baseline runs are chosen: they cost milliseconds each,
+and save two of three runs."""
 _REFERENCES = {"r157-cc": "a careful and competent driver", "r157-fsm": "a driver by the fuzzy safety model"}
 """Drivers of UN Regulation No. 157 in plain words."""
 
 
 def onset_steps(step: IntArray, lead: IntArray) -> IntArray:
-    """Steps of the onset of events in given steps (n,), with a ``lead`` (n,)."""
+    """Steps (n,) in which events begin that are done in ``step`` (n,), ``lead`` (n,) steps later."""
     return np.asarray(np.maximum(step - lead, 0))
 
 
@@ -50,11 +50,11 @@ def onset_steps(step: IntArray, lead: IntArray) -> IntArray:
 class KeptEvents:
     """A weighted sample of events, each with what has to be known to repeat it.
 
-    Within a shell all have the same probability. ``path``, ``step``, ``cell`` (n,): which path of the pool, which of
-    its events, and cell; ``facts``, ``at``, ``lead`` (n,): see `Chosen` of families. ``crashes`` (n, D + R): which
+    Within a shell all have the same weight. ``path``, ``step``, ``cell`` (n,): number of the path, place of the event
+    on it, and its cell; ``facts``, ``at``, ``lead`` (n,): see `Chosen` of families. ``crashes`` (n, D + R): which
     surrogates crash, in the pool's order, and which references. ``path_mass`` (n, C) float32: the path's probability of
-    an event of each cell. The pool of a vehicle that acts before the event has ``motion`` (n,), hashes of what it did
-    through the step of the event, or of its onset, and ``mass`` (n,), the probability of those that each stands for.
+    an event of each cell. The pool of a vehicle that acts before the event has ``motion`` (n,), hashes of the vehicle's
+    motion through the step of the event's onset, and ``mass`` (n,), the probability of the events that each stands for.
     """
 
     path: IntArray
@@ -80,7 +80,7 @@ class KeptEvents:
 
     @property
     def row(self) -> IntArray:
-        """Which row of the pool's paths each is of, shape (n,): in the pool of a vehicle its baseline run."""
+        """Row of its path among those of the pool, shape (n,): in the pool of a vehicle its baseline run."""
         return np.asarray(self.path - PILOT_PATHS)
 
 
@@ -94,7 +94,7 @@ class Pool:
     their standard errors, ``reference_rate`` and ``reference_square`` (R,) see `ShellDesign`. Cells divide shells by
     which references crash: ``cell_shell``, ``cell_references`` (C,) are the shell of each and one bit per reference,
     ``cell_p`` (C,) its probability. ``p_after_failure`` is the probability, at most, of events after a baseline run has
-    failed: nothing is known about them.
+    failed, which are unknown.
     """
 
     key: str
@@ -149,9 +149,9 @@ class Pool:
 
 
 def pool_content(pool: Pool) -> bytes:
-    """A pool as the content of a file, without its library, of which the key holds what matters."""
-    known = {each.name: getattr(pool, each.name) for each in fields(pool) if each.name not in ("library", "events")}
-    np.savez(file := BytesIO(), **known, **vars(pool.events))
+    """A pool as the content of a file, without its library, which is part of the key."""
+    columns = {each.name: getattr(pool, each.name) for each in fields(pool) if each.name not in ("library", "events")}
+    np.savez(file := BytesIO(), **columns, **vars(pool.events))
     return bytes(pa.compress(file.getbuffer(), codec="zstd", asbytes=True))
 
 
@@ -162,19 +162,19 @@ def pool_from(content: bytes, library: Library) -> Pool:
         arrays = {name: stored[name] for name in stored.files}
     events = KeptEvents(**{each.name: arrays.pop(each.name) for each in fields(KeptEvents)})
     names = tuple(arrays.pop("names").tolist())
-    known: dict[str, Any] = {name: array if array.ndim else array.item() for name, array in arrays.items()}
-    return Pool(**known, names=names, library=library, events=events)
+    columns: dict[str, Any] = {name: array if array.ndim else array.item() for name, array in arrays.items()}
+    return Pool(**columns, names=names, library=library, events=events)
 
 
 def conservative_first(rates: FloatArray) -> IntArray:
-    """Order of the surrogates by the rates (n, D + 1) of paths, as places in the library, shape (D,)."""
+    """Surrogates, as places in the library (D,), by their mean of the paths' rates (n, D + 1), the lowest first."""
     return np.asarray(np.argsort(rates[:, :-1].mean(0), kind="stable"))
 
 
 def shells_of(crashes: IntArray, order: IntArray) -> Int8Array:
-    """Shell of events: the place in the order of the first surrogate that crashes, D if none does.
+    """Shell of events: the place in the ``order`` (D,) of the first surrogate that crashes, D if none does.
 
-    ``crashes``, of any shape, has one bit per surrogate; ``order`` (D,) are the bits as `conservative_first` puts them.
+    ``crashes``, of any shape, has one bit per surrogate, in the library's order.
     """
     shell = np.full(crashes.shape, len(order), np.int8)
     for place in reversed(range(len(order))):
@@ -185,14 +185,14 @@ def shells_of(crashes: IntArray, order: IntArray) -> Int8Array:
 def cells_of(
     mass: FloatArray, shell: Int8Array, references: IntArray, n_references: int
 ) -> tuple[IntArray, IntArray, IntArray, FloatArray]:
-    """Cells of events with ``mass``, of a ``shell``, on which ``references`` crash (one bit each): all (n, steps).
+    """Divide events into cells, by their ``shell`` and the ``references`` that crash (one bit each).
 
-    Returns the cell of each event (n, steps), shell and references of each cell (C,), and each path's mass in it
-    (n, C).
+    ``mass``, ``shell`` and ``references`` are (n, steps). Returns the cell of each event (n, steps), shell and
+    references of each cell (C,), and each path's mass in it (n, C).
     """
     kind = (shell.astype(np.int64) << n_references) | references
     kinds = np.unique(kind[mass > 0.0])
-    cell = np.minimum(np.searchsorted(kinds, kind), kinds.size - 1)  # without mass it may be of no kind
+    cell = np.minimum(np.searchsorted(kinds, kind), kinds.size - 1)  # an event without mass may have no cell
     flat = np.arange(len(mass))[:, None] * kinds.size + cell
     by_path: FloatArray = np.bincount(flat.ravel(), mass.ravel(), minlength=len(mass) * kinds.size).astype(np.float64)
     return cell, kinds >> n_references, kinds & ((1 << n_references) - 1), by_path.reshape(len(mass), kinds.size)
@@ -206,12 +206,12 @@ def acceleration_limit(av: AutomatedVehicle) -> float:
 
 
 def tested_limit(campaign: Campaign) -> float:
-    """Hardest acceleration that a campaign's strata allow for."""
+    """Hardest acceleration (m/s²) that a campaign's strata allow for."""
     return math.inf if campaign.testing.shells.beyond_envelope else acceleration_limit(campaign.av)
 
 
 def shells_in_strata(pool: Pool, limit_mps2: float) -> list[list[int]]:
-    """Which shells of the pool make up each stratum, for a vehicle that accelerates so hard; empty ones none."""
+    """Shells of each stratum, for a vehicle with this limit of acceleration; shells without events in none."""
     boundary = boundary_shell(pool)
     present = [s for s in range(pool.shell_p.size) if pool.shell_p[s] > 0.0]
     tested = present if limit_mps2 > pool.library.envelope_mps2 else [s for s in present if s < len(pool.names)]
@@ -296,16 +296,16 @@ class Draw:
 class PrescribedEpisodes:
     """The tests of a shells campaign.
 
-    Each stratum's events are taken in a random order that is fixed by the campaign's seed: within a shell without
-    replacement. In a stratum of several shells the shell is drawn first, by its probability; the order ends where a
-    shell has no event left.
+    Each stratum takes its events in a random order that the campaign's seed fixes, without replacement. In a stratum of
+    several shells each draw first chooses the shell, by its probability; the order ends where a shell has no event
+    left.
     """
 
     def __init__(self, resolved: Resolved, pool: Pool) -> None:
         campaign, self._resolved = resolved.campaign, resolved
         limit = tested_limit(campaign)
         design, groups = design_shells(pool, limit), shells_in_strata(pool, limit)
-        self._kept = pool.events
+        self._events = pool.events
         self._cells = cells_in_strata(pool, groups)[0]
         self._order = [_order(pool, group, campaign.seed, stratum) for stratum, group in enumerate(groups)]
         self._order += [np.zeros(0, np.int64)] * (len(design.strata) - len(groups))
@@ -319,28 +319,29 @@ class PrescribedEpisodes:
     def rows(self, draws: tuple[Draw, ...]) -> tuple[IntArray, IntArray]:
         """Rows of the pool's events, and their strata, shape (n,) each; IndexError beyond what a stratum allows."""
         for draw in draws:
-            allowed, asked = self.design.available[draw.stratum], draw.first + draw.n
-            if asked > allowed:
-                raise IndexError(f"stratum {draw.stratum} allows {allowed} draws, {asked} were asked for")
+            available, end = self.design.available[draw.stratum], draw.first + draw.n
+            if end > available:
+                raise IndexError(f"stratum {draw.stratum} allows {available} draws, {end} were asked for")
         rows = [self._order[draw.stratum][draw.first : draw.first + draw.n] for draw in draws]
         return np.concatenate(rows), np.repeat([draw.stratum for draw in draws], [draw.n for draw in draws])
 
     def events(self, rows: IntArray) -> PrescribedEvents:
-        """What records say of given events of the pool (n,)."""
-        joined = np.eye(len(self.design.cell_stratum) + 1)[self._cells, :-1]  # the last row is for what is not tested
-        c, mass = self._kept, self._kept.path_mass[rows] @ joined
-        acts = slice(None) if self.design.shadow_runs else slice(0)
-        return PrescribedEvents(rows, self._cells[c.cell[rows]], mass, c.row[rows[acts]], c.mass[rows[acts]])
+        """Columns of the records for given events of the pool (n,)."""
+        events = self._events
+        joined = np.eye(len(self.design.cell_stratum) + 1)[self._cells, :-1]  # row -1 is for cells that are not tested
+        mass = events.path_mass[rows] @ joined
+        acts = rows if self.design.shadow_runs else rows[:0]
+        return PrescribedEvents(rows, self._cells[events.cell[rows]], mass, events.row[acts], events.mass[acts])
 
     def of_rows(self, rows: IntArray, stratum: IntArray) -> Traffic:
         """Tests of given events of the pool (n,), for given strata (n,)."""
-        c, resolved = self._kept, self._resolved
-        chosen = Chosen(c.facts[rows], c.at[rows], c.lead[rows])
+        events, resolved = self._events, self._resolved
+        chosen = Chosen(events.facts[rows], events.at[rows], events.lead[rows])
         script = resolved.family.script(resolved.environment, chosen)
         log_weight = elementary.log(self.design.p[stratum])
         script = script._replace(stratum=stratum.astype(np.int64), log_weight=log_weight)
-        if c.acts:
-            script = script._replace(announced_index=c.row[rows], motion_hash=c.motion[rows])
+        if events.acts:
+            script = script._replace(announced_index=events.row[rows], motion_hash=events.motion[rows])
         return Traffic(script, chosen.facts)
 
 
@@ -351,13 +352,12 @@ def _order(pool: Pool, group: list[int], seed: int, stratum: int) -> IntArray:
     if len(rows) == 1:
         return rows[0]
     p = pool.shell_p[group]
-    which = np.minimum(
-        np.searchsorted(np.cumsum(p) / p.sum(), rng.random(sum(map(len, rows))), side="right"), len(rows) - 1
-    )
-    order, end = np.zeros(which.size, np.int64), which.size
+    u = rng.random(sum(map(len, rows)))
+    shell = np.minimum(np.searchsorted(np.cumsum(p) / p.sum(), u, side="right"), len(rows) - 1)
+    order, end = np.zeros(shell.size, np.int64), shell.size
     for s, members in enumerate(rows):
-        chosen = np.flatnonzero(which == s)
-        order[chosen[: members.size]] = members[: chosen.size]
-        if chosen.size > members.size:
-            end = min(end, int(chosen[members.size]))
+        draws = np.flatnonzero(shell == s)
+        order[draws[: members.size]] = members[: draws.size]
+        if draws.size > members.size:
+            end = min(end, int(draws[members.size]))
     return order[:end]

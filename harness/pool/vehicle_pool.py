@@ -1,13 +1,13 @@
-"""The pool of one vehicle that acts before the event: paths that it walks itself, and surrogates that take over.
+"""The pool of one vehicle that acts before the event: paths that it drives itself, on which surrogates take over.
 
 LV's and BV's motion does not depend on the AV, and so neither does the choice of paths: a path's weight is known before
-the vehicle has moved. Candidates are aimed paths of the pool, walked in the twin beside an AV that holds its speed;
-paths are drawn from them with replacement, by how much they contribute to the surrogates' crash rates, with a share
-that is drawn evenly and bounds every weight.
+the vehicle has moved. Candidates are aimed paths of the pool, walked in the twin beside an AV that holds its speed.
+Paths are drawn from them with replacement, mostly by how much they contribute to the surrogates' crash rates; a share
+is drawn evenly, which bounds every weight.
 
-Along each path the vehicle is then driven once without an event, its *baseline run*. Where it was says how probable an
-event was in each step. Surrogates take over from it after the step of the event, in which it still does what it did.
-So shells, their probabilities and their moments are those of this vehicle; allocation and estimates stay what they are.
+Along each path the vehicle is then driven once without an event, its *baseline run*. Its positions there decide how
+probable an event is in each step. Surrogates take over from it after the step of the event, in which it still does what
+it did. So shells and their probabilities are those of this vehicle; allocation and estimates are as for any other.
 """
 
 from __future__ import annotations
@@ -33,19 +33,20 @@ from harness.resolved import Resolved
 from harness.vocabulary import FloatArray, IntArray, RecordArray
 
 EVENLY = 0.1
-"""Share of the choice that does not look at surrogates: no path counts for more than ten times its even weight."""
+"""Share of paths that are drawn evenly: none gets more than ten times the weight that it has if all are."""
 CHOICE_DRAW = 2
-"""Draw of a baseline run within the diagnostic stream."""
+"""Draw within the diagnostic stream by which a baseline run's path is chosen."""
 
 
 @dataclass(frozen=True, eq=False)
 class BaselinePaths:
-    """Independent draws of paths; some may be the same path, for runs with random streams of their own.
+    """Independent draws of paths; several may be the same path, for runs with random streams of their own.
 
     ``key`` is the content hash of all that they follow from, ``seed`` that of their random numbers. ``order`` (D,) are
-    the surrogates as places in the library, the most conservative behind an AV that holds its speed first. ``index``,
-    ``start``, ``weight`` (n,) are the paths' numbers, how they begin, and naturalistic density over that of the draw.
-    ``p_held`` (2,) is the probability of an event ahead of an AV that holds its speed, and its standard error.
+    the surrogates as places in the library, by their crash rates after holding speed, the most conservative first.
+    ``index``, ``start``, ``weight`` (n,) are the paths' numbers, how they begin, and naturalistic density over that of
+    the draw. ``p_held`` (2,) is the probability of an event ahead of an AV that holds its speed, and its standard
+    error.
     """
 
     key: str
@@ -58,7 +59,7 @@ class BaselinePaths:
 
     @property
     def paths(self) -> Paths:
-        """Without their weights."""
+        """The paths without their weights."""
         return Paths(self.index, self.start)
 
     def __len__(self) -> int:
@@ -67,21 +68,21 @@ class BaselinePaths:
 
 @dataclass(frozen=True, eq=False)
 class Candidates(BaselinePaths):
-    """Paths to choose from, each with its ``chance`` (n,) in every draw, and the ``weight`` that it has if drawn."""
+    """Paths to draw from, each with its ``chance`` (n,) in every draw, and the ``weight`` that it has if drawn."""
 
     chance: FloatArray
 
     def draw(self, n: int) -> BaselinePaths:
-        """So many of them, with replacement."""
+        """Draw ``n`` of them, with replacement."""
         u = uniforms(self.seed, 0, n, DIAGNOSTIC, CHOICE_DRAW + 1)[:, CHOICE_DRAW]
         cumulative = np.cumsum(self.chance)
-        chosen = np.minimum(np.searchsorted(cumulative, u * cumulative[-1], side="right"), len(self) - 1)
-        of_each = self.index[chosen], self.start[chosen], self.weight[chosen]
-        return BaselinePaths(self.key, self.seed, self.order, *of_each, self.p_held)
+        rows = np.minimum(np.searchsorted(cumulative, u * cumulative[-1], side="right"), len(self) - 1)
+        index, start, weight = self.index[rows], self.start[rows], self.weight[rows]
+        return BaselinePaths(self.key, self.seed, self.order, index, start, weight, self.p_held)
 
 
 def walk_candidates(resolved: Resolved, key: str, progress: Progress, candidates: int = CANDIDATES) -> Candidates:
-    """Walk so many paths beside an AV that holds its speed."""
+    """Walk aimed paths beside an AV that holds its speed, as ``candidates`` for baseline runs."""
     aim = take_aim(resolved, progress)
     progress.stage("paths for baseline runs", candidates)
     n_surrogates = len(resolved.library.surrogates)
@@ -101,23 +102,23 @@ def chances(rates: FloatArray, share: FloatArray) -> FloatArray:
     importance = contributions(rates, share)
     mean = importance.mean()
     chance = EVENLY + (1.0 - EVENLY) * (importance / mean if mean > 0.0 else np.ones_like(importance))
-    found: FloatArray = chance / chance.sum()
-    return found
+    normalised: FloatArray = chance / chance.sum()
+    return normalised
 
 
 def _candidates_key(resolved: Resolved) -> str:
-    """Hash of all that the candidates depend on: that of the pool which they are of, and code."""
-    own = hashlib.sha256(Path(__file__).read_bytes()).hexdigest()
-    return hashlib.sha256(json.dumps([campaign_pool_key(resolved), own]).encode()).hexdigest()[:24]
+    """Hash of all that the candidates depend on: the key of their pool, and this file."""
+    code = hashlib.sha256(Path(__file__).read_bytes()).hexdigest()
+    return hashlib.sha256(json.dumps([campaign_pool_key(resolved), code]).encode()).hexdigest()[:24]
 
 
 def baseline_paths_name(resolved: Resolved) -> str:
-    """What the candidates of a campaign's paths are kept under."""
+    """Name of the candidates' file in the cache."""
     return f"pools/baseline-{_candidates_key(resolved)}.npz"
 
 
 def campaign_baseline_paths(resolved: Resolved, progress: Progress) -> BaselinePaths:
-    """The paths that a campaign's vehicle is to walk, of candidates from the cache, or walked and cached."""
+    """Draw the paths that a campaign's vehicle is to drive, from candidates of the cache, or walked and cached."""
     key, name = _candidates_key(resolved), baseline_paths_name(resolved)
     if (content := cache.read(name)) is not None:
         with np.load(BytesIO(content)) as stored:
@@ -131,28 +132,29 @@ def campaign_baseline_paths(resolved: Resolved, progress: Progress) -> BaselineP
 
 
 def vehicle_pool(resolved: Resolved, paths: BaselinePaths, runs: Recorded) -> Pool:
-    """Pool of the vehicle that was driven along the paths.
+    """Pool of the vehicle that was driven along the paths in these baseline ``runs``.
 
     Raises `HarnessError`: no event was found on which even the envelope crashes.
     """
     environment = resolved.environment
     followers = resolved.library.followers(resolved.family.shows(environment))
-    found = resolved.family.events(environment, paths.seed, paths.paths, followers, runs)
-    if not found.crashes.any():
+    events = resolved.family.events(environment, paths.seed, paths.paths, followers, runs)
+    if not events.crashes.any():
         failed = f" ({n:,} of them failed)" if (n := int(runs.failed.sum())) else ""
-        none = f"no event on {len(paths):,} paths{failed} after which even the most careless surrogate would crash"
+        found = f"no event on {len(paths):,} paths{failed} after which even the most careless surrogate would crash"
         mend = (
             "Raise pool.shadow_paths, use testing.method forced, or see whether the vehicle moves (`harness av-check`)."
         )
-        raise HarnessError("baseline runs", none, "some: the crash rate is estimated from them", mend)
-    mass = found.probability * paths.weight[:, None]
-    enumerated = EnumeratedPaths(paths.index, paths.start, paths.weight, mass, found.crashes)
+        raise HarnessError("baseline runs", found, "some: the crash rate is estimated from them", mend)
+    mass = events.probability * paths.weight[:, None]
+    enumerated = EnumeratedPaths(paths.index, paths.start, paths.weight, mass, events.crashes)
     key = hashlib.sha256(" ".join((paths.key, resolved.content_hash, runs.digest())).encode()).hexdigest()[:24]
     pool = pool_of(resolved, enumerated, key, paths.order)
     hashes = motion_hashes(runs.x_m, runs.v_mps)
     row, step, onset = pool.events.row, pool.events.step, pool.events.onset
-    # A kept event stands for its like nearby, too, where these are too improbable to be kept one by one.
+    # A kept event also stands for similar ones that are too improbable to be kept: at least its share of the shell.
     least = pool.shell_p[pool.shell] * (len(paths) / np.bincount(pool.shell)[pool.shell])
-    events = replace(pool.events, motion=hashes[row, onset], mass=np.maximum(mass[row, step], least))
-    p_after_failure, (p_held, p_held_se) = float((found.after_failure * paths.weight).mean()), paths.p_held.tolist()
-    return replace(pool, events=events, p_after_failure=p_after_failure, p_held=p_held, p_held_se=p_held_se)
+    kept = replace(pool.events, motion=hashes[row, onset], mass=np.maximum(mass[row, step], least))
+    p_after_failure = float((events.after_failure * paths.weight).mean())
+    p_held, p_held_se = paths.p_held.tolist()
+    return replace(pool, events=kept, p_after_failure=p_after_failure, p_held=p_held, p_held_se=p_held_se)

@@ -1,4 +1,4 @@
-"""How tests are drawn, by method: `source_of` names the class, `prepare` builds what its tests are drawn from.
+"""How tests are drawn, by method: `source_of` is the class, `prepare` builds what its tests are drawn from.
 
 Where the event of a test is drawn, and its weight made:
 
@@ -7,7 +7,7 @@ Where the event of a test is drawn, and its weight made:
   from which shell says `shells.Allocation`;
 - methods of a family's own draw it in the loop (`Family.sources`), as NADE's mixtures do.
 
-All have one shape (`protocol`); what is to be known of every method, such as whether it needs surrogates, stands in
+All have one shape (`protocol`); properties of each method, such as whether it needs surrogates, are listed in
 `harness.vocabulary.SAMPLING`.
 """
 
@@ -37,8 +37,8 @@ def source_of(campaign: Campaign) -> type[Source]:
     method = campaign.testing.method
     if method in _SOURCES and not (method == "nde" and campaign.av.acts_before_event):
         return _SOURCES[method]
-    found: type[Source] = resolve_name(family_named(campaign.scenario).sources[method])
-    return found  # also where its events are depends on what the vehicle does
+    own: type[Source] = resolve_name(family_named(campaign.scenario).sources[method])
+    return own  # the family's own; also `nde` of a vehicle that acts before the event, which changes the events
 
 
 def prepare(resolved: Resolved, progress: Progress | None = None) -> Source:

@@ -2,10 +2,10 @@
 
 A vehicle that acts before the event is driven along each path without one, to know where it is: its baseline run. A
 test repeats the path with an event, and tells the vehicle the index of the baseline run, so that both see the same
-random stream. What the vehicle did through the step of the event must be the same to the last bit, or the test fails.
+random stream. What the vehicle does through the step of the event must be the same to the last bit, or the test fails.
 
-Of events that are milder than those that count some are driven, so that it is said where the vehicle crashes there.
-They enter no rate, and a vehicle that crashes on them is not accepted.
+Some events are driven that are milder than those that count: they enter no rate, but a vehicle that crashes on them is
+not accepted.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ from harness.vehicles.drivers import Followers, driver_records
 SHARD_RUNS = 50
 """Baseline runs of one task: half a second of a slow controller."""
 IN_WORDS = {SHADOW: "baseline runs", MILDER: "milder events"}
-"""Of each table."""
+"""What the rows of each table are."""
 N_MILDER = 36
 """Tests of milder events: a vehicle that crashes on a tenth of them is found out 98 times in 100."""
 EVENT_DRAW = 1
@@ -56,8 +56,8 @@ class Naturalistic(Source):
     """At most one event, by its probability, from one uniform: each test weighs 1."""
 
     def tests(self, first_episode: int, n_episodes: int) -> Traffic:
-        resolved, paths = self.resolved, self.paths(first_episode, n_episodes)
-        family, environment, seed = resolved.family, resolved.environment, self.campaign.seed
+        paths = self.paths(first_episode, n_episodes)
+        family, environment, seed = self.resolved.family, self.resolved.environment, self.campaign.seed
         cumulative = np.cumsum(family.events(environment, seed, paths, NOBODY).probability, axis=1)
         u = uniforms(seed, first_episode, n_episodes, EVENT, EVENT_DRAW + 1)[:, EVENT_DRAW]
         event = np.where(u < cumulative[:, -1], (cumulative <= u[:, None]).sum(1), -1)
@@ -66,7 +66,7 @@ class Naturalistic(Source):
 
 
 class Forced(Source):
-    """Every test has an event, drawn given that there is one; its weight is the probability of that on its path.
+    """Every test has an event, drawn given that there is one; its weight is the probability of one on its path.
 
     A vehicle that acts before the event is driven along the path without one first, which prescribes the test.
     """
@@ -84,19 +84,21 @@ class Forced(Source):
 def forced_after_runs(loop: EpisodeLoop, resolved: Resolved, paths: Paths) -> Traffic:
     """Tests (n,), each after a baseline run of its own on the same path.
 
-    Where that fails there is no event; the test fails as well, and weighs what it may have hidden.
+    Where that fails there is no event: the test fails as well, and weighs the events that may have come after.
     """
     parts = []
     for begin in range(0, len(paths.number), AT_ONCE):
         some = Paths(*(column[begin : begin + AT_ONCE] for column in paths))
-        parts.append(forced(resolved, some, recorded(without_event(loop, resolved, resolved.campaign.seed, some))))
+        runs = recorded(without_event(loop, resolved, resolved.campaign.seed, some))
+        parts.append(forced(resolved, some, runs))
     script = Script._make(np.concatenate(columns) for columns in zip(*(part.script for part in parts), strict=True))
     return Traffic(script, np.concatenate([part.facts for part in parts]))
 
 
 def forced(resolved: Resolved, paths: Paths, runs: Recorded = HOLDING) -> Traffic:
-    """Tests (n,), where the vehicle keeps its speed until the event, or did so in baseline runs."""
-    family, environment, seed, n = resolved.family, resolved.environment, resolved.campaign.seed, len(paths.number)
+    """Tests (n,) with an event on each path, along which the vehicle holds its speed or moves as in its ``runs``."""
+    family, environment, seed = resolved.family, resolved.environment, resolved.campaign.seed
+    n = len(paths.number)
     events = family.events(environment, seed, paths, NOBODY, runs)
     u = uniforms(seed, int(paths.number[0]), n, EVENT, EVENT_DRAW + 1)[:, EVENT_DRAW]
     cumulative = np.cumsum(events.probability, axis=1)
@@ -114,37 +116,37 @@ def forced(resolved: Resolved, paths: Paths, runs: Recorded = HOLDING) -> Traffi
 
 
 def without_event(loop: EpisodeLoop, resolved: Resolved, seed: int, paths: Paths, first: int | None = None) -> Shard:
-    """Drive the loop's vehicle along paths (n,) on which nothing happens.
+    """Drive the loop's vehicle along paths (n,) without an event.
 
-    The first is its episode ``first``, or of the path's own number.
+    The first run is episode ``first``, by default the number of its path.
     """
-    none = np.full(len(paths.number), -1, np.int64)
-    chosen = resolved.family.choose(resolved.environment, seed, paths, none)
+    no_event = np.full(len(paths.number), -1, np.int64)
+    chosen = resolved.family.choose(resolved.environment, seed, paths, no_event)
     traffic = Traffic(resolved.family.script(resolved.environment, chosen), chosen.facts)
     return loop.beside(keep=ALL_MOTION).run(int(paths.number[0]) if first is None else first, traffic)
 
 
 def recorded(shard: Shard) -> Recorded:
-    """Baseline runs as they come from the loop."""
+    """Arrays of baseline runs that the loop has just driven."""
     row = np.arange(shard.episode.size)
     return as_recorded(baseline_table(shard, row, np.ones(row.size)), shard.scenario.max_steps)
 
 
 @dataclass(frozen=True)
 class BaselineResult:
-    """A finished range: its table."""
+    """The table of a finished range of baseline runs, or of tests of milder events."""
 
     request: ShardRequest
     table: pa.Table
 
     @property
     def failures(self) -> Counter[str]:
-        """Causes of failures."""
+        """Number of failures by cause."""
         return Counter(self.table.column("failure").drop_null().to_pylist())
 
 
 def requests_before(name: str, n: int) -> Iterator[ShardRequest]:
-    """So many baseline runs, or tests of milder events, in order."""
+    """Requests for ``n`` baseline runs, or tests of milder events, in order; ``name`` is that of their table."""
     firsts = enumerate(range(0, n, SHARD_RUNS))
     return (ShardRequest(index, first, min(SHARD_RUNS, n - first), before=name) for index, first in firsts)
 
@@ -157,19 +159,19 @@ def run_baseline(loop: EpisodeLoop, paths: BaselinePaths, resolved: Resolved, re
 
 
 def stored_table(folder: Path, before: Mapping[str, Part], name: str) -> pa.Table | None:
-    """What an earlier run has made of a table, as the manifest lists it ``before`` tests; None of one that is gone."""
-    there = name in before and (folder / before[name].files[name].path).exists()
-    return read_kept(folder, before[name], name) if there else None
+    """A table that the manifest lists as ``before`` the tests; None where it lists none, or the file is gone."""
+    exists = name in before and (folder / before[name].files[name].path).exists()
+    return read_kept(folder, before[name], name) if exists else None
 
 
 def stored_baseline(
     stored: pa.Table | None, paths: BaselinePaths | None, request: ShardRequest
 ) -> BaselineResult | None:
-    """A range that is ``stored``, or None; a `RunFolderError` if that is of other paths."""
+    """The requested range of a ``stored`` table, None where it is shorter; a `RunFolderError` if of other paths."""
     if stored is None or stored.num_rows < request.rows.stop:
         return None
     table = stored.slice(request.first_episode, request.n_episodes)
-    if paths is None or request.before == MILDER:  # which they are the campaign says
+    if paths is None or request.before == MILDER:  # milder events follow from the campaign alone
         return BaselineResult(request, table)
     if not np.array_equal(table.column("path").to_numpy(), paths.index[request.rows]):
         expected = "those of this campaign and this version of the harness"
@@ -179,7 +181,7 @@ def stored_baseline(
 
 
 def begin(source: Source, drive: Callable[[str, int], pa.Table]) -> tuple[pa.Table, Recorded]:
-    """Let a campaign's tests follow from baseline runs, whose table ``drive`` gives: as it is, and as arrays."""
+    """Let a campaign's tests follow from the baseline runs that ``drive`` makes or reads: their table, and arrays."""
     table = drive(SHADOW, len(source.baseline_paths or ()))
     runs = as_recorded(table, source.scenario.max_steps)
     source.begin_after(runs)
@@ -187,17 +189,17 @@ def begin(source: Source, drive: Callable[[str, int], pa.Table]) -> tuple[pa.Tab
 
 
 def read_stored(folder: Path, paths: BaselinePaths, before: Mapping[str, Part], name: str, n: int) -> pa.Table:
-    """All of a run folder's; a `RunFolderError` if some are missing or damaged."""
+    """All ``n`` rows of a run folder's table; a `RunFolderError` if some are missing or damaged."""
     stored = stored_table(folder, before, name)
     if stored is None or any(stored_baseline(stored, paths, request) is None for request in requests_before(name, n)):
-        there = f"{0 if stored is None else stored.num_rows} {IN_WORDS[name]}"
+        found = f"{0 if stored is None else stored.num_rows} {IN_WORDS[name]}"
         expected = f"all {n}: they say what is tested, and how probable it is"
-        raise RunFolderError(str(folder / name), there, expected, "Let `harness run` go on with --resume.")
+        raise RunFolderError(str(folder / name), found, expected, "Let `harness run` go on with --resume.")
     return stored
 
 
 def as_recorded(table: pa.Table, max_steps: int) -> Recorded:
-    """All baseline runs of a campaign as arrays."""
+    """A table of baseline runs as arrays, shape (n,) or (n, max_steps + 1)."""
     n_steps = table.column("n_steps").to_numpy().astype(np.int64)
     failed = np.asarray(pc.equal(table.column("outcome").cast(pa.string()), "failed"))
     motion = (padded(table.column(name), max_steps + 1)[0] for name in ("av_position_m", "av_speed_mps"))
@@ -213,7 +215,7 @@ def run_milder(loop: EpisodeLoop, resolved: Resolved, request: ShardRequest) -> 
 
 
 def milder_of(resolved: Resolved, table: pa.Table) -> dict[str, Any]:
-    """Tests, crashes and failures, by their table of episodes, and how many such events an hour of driving has."""
+    """Numbers of tests of milder events, their crashes and failures, and how often such events are met per hour."""
     family, crashes = resolved.family, pc.equal(table.column("outcome").cast(pa.string()), "crash")
     if above := resolved.campaign.crash.counts_above_mps:
         crashes = pc.and_(crashes, pc.fill_null(pc.greater(table.column("impact_speed_mps"), above), fill_value=False))
@@ -223,11 +225,11 @@ def milder_of(resolved: Resolved, table: pa.Table) -> dict[str, Any]:
 
 
 def n_left_out(campaign: Campaign, n_before_event: int) -> int:
-    """Crashes before the event, where a vehicle that follows is tested around events alone: it needs none to crash."""
+    """Crashes before the event that no rate counts: of a vehicle that follows, which is tested around events alone."""
     follows = family_named(campaign.scenario).follows
     return n_before_event if follows and campaign.testing.method != "nde" else 0
 
 
 def beyond_scope(milder: Mapping[str, Any] | None) -> int:
-    """How many of the milder tests speak against a vehicle: one that has failed may have hidden a crash."""
+    """Milder tests that speak against a vehicle: crashes, and failures, which may have hidden one."""
     return 0 if milder is None else milder["n_crashes"] + milder["n_failed"]

@@ -1,7 +1,7 @@
-"""The one shape that all ways of drawing tests have: what episodes need, rounds of tests, and when they are enough.
+"""What the runner knows of a way of drawing tests: the class `Source`, its rounds of tests, and when they are enough.
 
-A way of drawing is a class. What holds for the way itself stands on the class and is asked before anything is built; an
-instance holds what the tests of one campaign are drawn from. The runner knows no more of a method than this.
+What holds for the way itself is an attribute of the class and is asked before anything is built; an instance holds what
+the tests of one campaign are drawn from.
 """
 
 from __future__ import annotations
@@ -37,9 +37,9 @@ from harness.worlds import World
 
 @dataclass(frozen=True)
 class ShardRequest:
-    """A fixed range of episodes; ``draws`` says which events they are, where that is so.
+    """A fixed range of episodes; ``draws`` says which of the pool's events they are, where they are drawn from one.
 
-    What comes ``before`` tests that count has the name of its table.
+    ``before`` is the name of the table, if they are none of the tests that count but come before these.
     """
 
     index: int
@@ -50,15 +50,12 @@ class ShardRequest:
 
     @property
     def rows(self) -> slice:
-        """Places of its episodes among all."""
+        """Its episodes, as a slice of all."""
         return slice(self.first_episode, self.first_episode + self.n_episodes)
 
 
 class Rounds(Protocol):
-    """Requests in rounds; the next round is asked for when all of the last one have been added.
-
-    ``rule`` says why it is enough.
-    """
+    """Requests in rounds; the next round is asked for once all tests of the last one are added. ``rule`` ends them."""
 
     rule: Rule
 
@@ -70,7 +67,7 @@ class Rounds(Protocol):
 
 
 class KnownRounds(Rounds):
-    """All tests are known beforehand, in one round; a stop rule looks at the end of some of their shards."""
+    """One round of tests that are all known beforehand; a stop rule looks at the end of some of their shards."""
 
     rule: StopRule
 
@@ -96,12 +93,12 @@ class KnownRounds(Rounds):
 class Source:
     """What the tests of a campaign are drawn from, built or read from the cache; tests are independent by default.
 
-    ``scenario`` is what they have in common, and ``design`` has the strata of the ``pool`` for those of one. Along
+    ``scenario`` is what they have in common. Where they are drawn from a ``pool``, ``design`` has its strata. Along
     ``baseline_paths`` the vehicle has to be driven without an event before tests can be drawn; see `begin_after`.
     """
 
     columns: ClassVar[tuple[str, ...]] = EPISODE_COLUMNS
-    """Of the episodes table, that estimates need."""
+    """Columns of the episodes table that estimates need."""
     kernel: ClassVar[Callable[..., Any]] = staticmethod(judge)
     """One of those that have to be compiled."""
 
@@ -114,7 +111,7 @@ class Source:
 
     @classmethod
     def cached_files(cls, resolved: Resolved) -> list[str]:  # noqa: ARG003 - here nothing is built
-        """What building leaves in the cache, or has found there, by names: with it another machine builds nothing."""
+        """Names of the files that building leaves in the cache: with a copy of them another machine builds nothing."""
         return []
 
     def begin_after(self, runs: Recorded) -> None:  # noqa: ARG002 - there are none
@@ -143,11 +140,11 @@ class Source:
 
     def records(self, traces: str | None = None) -> RecordPolicy:
         """What the campaign asks to be recorded of its tests, or with other ``traces``."""
-        kept = self.campaign.records
-        return RecordPolicy(traces or kept.traces, kept.trace_share)
+        settings = self.campaign.records
+        return RecordPolicy(traces or settings.traces, settings.trace_share)
 
     def rounds(self, held: int) -> Rounds:  # noqa: ARG002 - only rounds that give up ask for it
-        """Rounds of tests, for a folder that holds so many already."""
+        """Rounds of tests, for a folder that holds ``held`` of them already."""
         return KnownRounds(self.campaign)
 
     def run(self, loop: EpisodeLoop, request: ShardRequest) -> Shard:
@@ -159,10 +156,10 @@ class Source:
         return self.run(loop, ShardRequest(0, episode, 1))
 
     def is_shard(self, request: ShardRequest, episodes: pa.Table) -> bool:
-        """Whether stored episodes are those that are asked for, and not the last shard of a smaller budget."""
+        """Whether stored episodes are the requested ones: the last shard of a smaller budget has fewer."""
         return bool(episodes.num_rows == request.n_episodes)
 
     def block(self, tables: Tables) -> Block:
-        """What the stop rule and estimates read of a shard."""
+        """The shard's tests as the stop rule and estimates read them."""
         steps = tables.get("moments") if self.campaign.sampling.mixes_steps else None
         return block_from_tables(self.campaign, tables["episodes"], steps, self.design)

@@ -1,9 +1,9 @@
-"""Events of the pool, drawn within shells, in rounds: each decides what the next one tests.
+"""Tests of the pool's events, drawn within shells, in rounds: the counts of each decide what the next one tests.
 
-A round is run to its end before the next begins, whatever the number of workers, and the result is looked at. Rounds
-grow geometrically, to where they narrow the interval most (`Allocation`): first a few tests of each stratum inside the
-boundary, until their rate is roughly known; then all. That depends on counts alone, not on the stop rule or on time: a
-run can be continued to a smaller RHW.
+A round is run to its end before the stop rule looks and the next begins, whatever the number of workers. Rounds grow
+geometrically, and go to where they narrow the interval most (`Allocation`): at first to strata inside the boundary,
+until their rate is roughly known; then to all. That depends on counts alone, not on the stop rule or on time: a run can
+be continued to a smaller RHW.
 """
 
 from __future__ import annotations
@@ -52,12 +52,12 @@ LEVEL = Level.two_sided(CONFIDENCE)
 FIRST_TESTS = 36
 """First tests of all strata within the boundary together, each its share of the probability there."""
 LEAST_FIRST_TESTS, MOST_FIRST_TESTS = 3, 12
-"""Of one stratum."""
+"""Limits of the first tests of one stratum."""
 MOST_INNER_TESTS = 8
-"""Testing turns to what lies outside after this many times the first tests, known or not."""
+"""Testing turns to what lies outside after this many times the first tests, even if the inner rate is not yet known."""
 SMALLEST_ROUND = 8
 ADDED = 0.25
-"""Crash, and test without one, that each stratum is thought to have had besides: without it those in which the first
+"""Crashes, and tests without one, that each tested stratum is credited with: without them the strata in which the first
 tests crash get all further ones, and the rate is 4 % too low for some vehicles (measured)."""
 USED_UP_SHARE = 0.95
 """Share of the squared widths that must lie in exhausted strata for the allocation to end."""
@@ -68,7 +68,7 @@ _IN_USE: WeakValueDictionary[str, Pool] = WeakValueDictionary()
 
 
 def pool_of(resolved: Resolved, progress: Progress) -> Pool:
-    """The pool of a campaign: the one that another run of this process, as of B beside A, has in use."""
+    """The pool of a campaign, shared with other runs of this process, as of B beside A."""
     key = campaign_pool_key(resolved)
     if (pool := _IN_USE.get(key)) is None or pool.library != resolved.library:
         pool = _IN_USE[key] = campaign_pool(resolved, progress)
@@ -102,8 +102,8 @@ class Shells(Source):
 
     @classmethod
     def cached_files(cls, resolved: Resolved) -> list[str]:
-        own = resolved.campaign.has_baseline_runs
-        return [baseline_paths_name(resolved) if own else pool_name(campaign_pool_key(resolved))]
+        acts = resolved.campaign.has_baseline_runs
+        return [baseline_paths_name(resolved) if acts else pool_name(campaign_pool_key(resolved))]
 
     def begin_after(self, runs: Recorded) -> None:
         if self.baseline_paths is None:
@@ -126,19 +126,19 @@ class Shells(Source):
         return shard
 
     def is_shard(self, request: ShardRequest, episodes: pa.Table) -> bool:
-        """See `Source`: nor of the last round of a smaller budget."""
-        events, wanted = episodes.column("pool_row"), self.prescribed.rows(request.draws)[0]
-        return super().is_shard(request, episodes) and not events.null_count and np.array_equal(events, wanted)
+        """See `Source`; and whether they have the requested events: the last round of a smaller budget has others."""
+        stored, wanted = episodes.column("pool_row"), self.prescribed.rows(request.draws)[0]
+        return super().is_shard(request, episodes) and not stored.null_count and np.array_equal(stored, wanted)
 
 
-def first_tests(design: ShellDesign, asked: int | None = None) -> IntArray:
-    """Tests that each stratum gets before anything is decided about it, shape (S,); ``asked`` is a number for all.
+def first_tests(design: ShellDesign, n_each: int | None = None) -> IntArray:
+    """Tests that each stratum gets before anything is decided about it, shape (S,): ``n_each``, if that is set.
 
     A stratum without a crash leaves about p_s/n_s open, and of several the largest counts. So tests go in proportion
     to the probability, which leaves the same open in each; further ones come where crashes are seen.
     """
-    if asked is not None:
-        return np.full(design.p.size, asked, np.int64)
+    if n_each is not None:
+        return np.full(design.p.size, n_each, np.int64)
     within = design.p[: design.n_inside].sum()
     share = np.ceil(FIRST_TESTS * design.p / within) if within > 0.0 else np.full(design.p.size, np.inf)
     return np.asarray(np.clip(share, LEAST_FIRST_TESTS, MOST_FIRST_TESTS).astype(np.int64))
@@ -148,10 +148,10 @@ def first_tests(design: ShellDesign, asked: int | None = None) -> IntArray:
 class Allocation:
     """How many tests each shell gets next.
 
-    Strata have the probabilities ``p`` (S,), known from ``n_paths``; ``n_inside`` are inside the boundary. One gets
-    ``first_tests`` before anything is decided about it, and at most those ``available``, (S,) each. With the
+    Strata have the probabilities ``p`` (S,), known from ``n_paths``; the first ``n_inside`` are inside the boundary.
+    Each gets ``first_tests`` (S,) before anything is decided about it, and at most the ``available`` (S,). With the
     ``statement`` `library` what lies outside the boundary is never tested. A round has at least ``smallest_round``
-    tests, where there are as many.
+    tests, where that many are left.
     """
 
     p: FloatArray
@@ -164,12 +164,12 @@ class Allocation:
 
     @classmethod
     def of(cls, shells: ShellSettings, design: ShellDesign, available: IntArray) -> Allocation:
-        """That of a campaign's ``testing.shells``."""
-        first, asked = first_tests(design, shells.first_tests), (shells.statement, shells.smallest_round)
-        return cls(design.p, design.n_inside, first, available, *asked, design.n_independent)
+        """The allocation that a campaign's ``testing.shells`` asks for."""
+        first, smallest = first_tests(design, shells.first_tests), shells.smallest_round
+        return cls(design.p, design.n_inside, first, available, shells.statement, smallest, design.n_independent)
 
     def is_first(self, tests: IntArray, added: IntArray) -> bool:
-        """Whether a round after so many tests per stratum, (S,) each, brings some that a stratum gets in any case."""
+        """Whether a round of ``added`` tests after ``tests``, (S,) each, has first tests of a stratum."""
         return bool(np.any((tests < self.first_tests)[added > 0]))
 
     @property
@@ -188,8 +188,8 @@ class Allocation:
         """Tests to add per stratum, at most ``budget``; all 0 when no stratum or no budget is left.
 
         Failed tests widen the limits that are to be narrowed: they may have been crashes. ``inner_rhw`` gives the
-        relative half-width from so many first strata, by default that of a crash rate; ``given_by`` gives so many tests
-        to strata with so much room (S,) each, by default to where a crash rate is narrowed.
+        relative half-width from the first n strata, by default that of a crash rate. ``given_by`` divides n tests among
+        strata that have room for so many, (S,), by default to where they narrow a crash rate most.
         """
         tests = tally.tests
         if self._used_up(tally):
@@ -214,7 +214,7 @@ class Allocation:
         return np.asarray(np.diff(np.minimum(np.cumsum(wanted), max(budget, 0)), prepend=0))  # cut from the last one on
 
     def _used_up(self, tally: Tally) -> bool:
-        """Whether nearly all that is left to know lies in strata without further events."""
+        """Whether nearly all of the remaining width lies in strata without further events."""
         tests, tail = tally.tests, (1.0 - CONFIDENCE) / 2.0
         low, high = clopper_pearson(tally.crashes, tests, tail, tally.failed)
         relevant = np.arange(tests.size) < self.n_asked
@@ -222,27 +222,29 @@ class Allocation:
         return bool(squares[tests >= self.available].sum() >= USED_UP_SHARE * squares.sum())
 
     def _n_begun(self, tests: IntArray, inner_rhw: Callable[[int], float]) -> int:
-        """Of how many strata it is time: of those inside the boundary while they leave much open."""
+        """Number of strata that are tested now: those inside the boundary alone, while they leave much open."""
         n = min(self.n_inside, self.n_asked)
         enough = n == self.n_asked or np.any(tests[n:] > 0) or np.all(tests[:n] >= self.available[:n])
         # Without this end a vehicle that crashes rarely inside, and often outside, would not be tested outside at all.
         enough = enough or tests[:n].sum() >= MOST_INNER_TESTS * self.first_tests[:n].sum()
         return self.n_asked if enough or inner_rhw(n) <= INNER_RHW else n
 
-    def _spread(self, tally: Tally, size: int, most: IntArray) -> IntArray:
-        weights, room = np.column_stack([self.p, np.zeros_like(self.p)]), ADDED * (tally.tests > 0)
+    def _spread(self, tally: Tally, size: int, room: IntArray) -> IntArray:
+        """Divide ``size`` tests among strata with ``room`` (S,) to where they narrow the crash rate most, (S,)."""
+        weights = np.column_stack([self.p, np.zeros_like(self.p)])
+        credit = ADDED * (tally.tests > 0)
         lower, upper = (
-            np.column_stack([crashes + room, tally.tests - crashes + room])
+            np.column_stack([crashes + credit, tally.tests - crashes + credit])
             for crashes in (tally.crashes, tally.crashes + tally.failed)
         )
-        return spread(weights, lower, upper, LEVEL, size, most)
+        return spread(weights, lower, upper, LEVEL, size, room)
 
 
 class ShellRounds(Rounds):
-    """Fed with finished tests of shells in order; says what is tested next, and when it is enough.
+    """Rounds of shells' tests: takes finished tests in order, says what is tested next, and when it is enough.
 
-    ``available``, shape (S,), are the most tests of each stratum, ``held`` see `RoundRule`; ``seen`` are the tests, of
-    which those that were cut off may have crashed wherever a limit is decided.
+    ``available`` (S,) are the most tests of each stratum; for ``held`` see `RoundRule`. ``seen`` are the tests so far;
+    where a limit is decided, those that were cut off count as possible crashes.
     """
 
     rule: RoundRule
@@ -274,16 +276,16 @@ class ShellRounds(Rounds):
         return self.enough_after(len(block))
 
     def enough_after(self, n: int) -> bool:
-        """Whether testing can end, with the next ``n`` tests in `seen`."""
+        """Whether testing can end, once the next ``n`` tests are in ``seen``."""
         self._n_episodes += n
         return self._n_episodes == self._look and self.rule.observe(self.seen)
 
 
 class SideBySide:
-    """Rounds of several pools, of which the strata stand for ``p`` (S,): those inside a boundary come first.
+    """Rounds over the strata of several pools together: those inside a boundary come first.
 
-    What is tested next follows from counts alone. ``available`` (S,) of each pool are the most tests of its strata;
-    ``rule`` looks at each round.
+    ``p`` (S,) is what the strata of all count in the answer; ``available`` (S,) of each pool are the most tests of its
+    strata; ``rule`` looks at each round. What is tested next follows from counts alone.
     """
 
     def __init__(
@@ -294,15 +296,17 @@ class SideBySide:
         available: Sequence[IntArray],
         rule: RoundRule | PairRule,
     ) -> None:
-        shells, self.rule, self._budget = campaign.testing.shells, rule, campaign.stop.episodes
+        self.rule, self._budget = rule, campaign.stop.episodes
+        shells = campaign.testing.shells
         inside = np.concatenate([np.arange(design.p.size) < design.n_inside for design in designs])
         self._order = np.argsort(~inside, kind="stable")
         self._place = np.argsort(self._order)
         self._ends = np.cumsum([design.p.size for design in designs])[:-1]
         first = np.concatenate([first_tests(design, shells.first_tests) for design in designs])
-        self._available, asked = np.concatenate(available), (shells.statement, shells.smallest_round)
-        most = self._available[self._order]
-        self._all = Allocation(p[self._order], int(inside.sum()), first[self._order], most, *asked)
+        self._available = np.concatenate(available)
+        first, room = first[self._order], self._available[self._order]
+        n_inside = int(inside.sum())
+        self._all = Allocation(p[self._order], n_inside, first, room, shells.statement, shells.smallest_round)
 
     def _next(
         self,
@@ -310,63 +314,62 @@ class SideBySide:
         inner_rhw: Callable[[], float],
         given_by: Callable[[int, IntArray], IntArray] | None = None,
     ) -> list[IntArray]:
-        """Tests to add per stratum of each pool; ``counts`` see `Tally.counted`."""
+        """Tests to add per stratum of each pool; ``counts`` are the columns of `Tally.counted`, over all strata."""
         tally = Tally.counted(*(column[self._order] for column in counts))
-        given = None if given_by is None else (lambda n, room: given_by(n, room[self._place])[self._order])
-        left = self._budget - int(tally.tests.sum())
-        added = self._all.next_round(tally, left, inner_rhw=lambda _: inner_rhw(), given_by=given)
+        in_order = None if given_by is None else (lambda n, room: given_by(n, room[self._place])[self._order])
+        budget = self._budget - int(tally.tests.sum())
+        added = self._all.next_round(tally, budget, inner_rhw=lambda _: inner_rhw(), given_by=in_order)
         self.rule.of_first_tests = self._all.is_first(tally.tests, added)
         return np.split(added[self._place], self._ends)
 
 
 class PairRounds(SideBySide):
-    """Says which pairs of tests of two vehicles are driven next.
+    """Rounds of pairs of tests of two vehicles, whose campaigns are equal but for the vehicle.
 
-    Rounds are those of one vehicle, with pairs in place of tests; within a round pairs go to where the likelihood ratio
-    says that one more narrows the interval of the difference most. The campaigns are equal but for the vehicle;
-    ``none`` are no pairs.
+    As rounds of one vehicle, with pairs in place of tests; within a round pairs go to where one more narrows the
+    likelihood ratio's interval of the difference most. ``none`` is an empty set of pairs.
     """
 
     rule: PairRule
 
     def __init__(self, campaign: Campaign, none: Pairs, available: Sequence[IntArray], rule: PairRule) -> None:
-        super().__init__(campaign, [of.design for of in none.each], none.p, available, rule)
+        super().__init__(campaign, [scenario.design for scenario in none.each], none.p, available, rule)
 
     def next_round(self, pairs: Pairs) -> list[IntArray]:
         """Pairs to add per stratum of each pool; all 0 when no stratum or no budget is left."""
-        tests, differing = pairs.tests, pairs.outcomes()[:, 1:3].sum(1)  # those stand in the crashes' place
+        tests, differing = pairs.tests, pairs.outcomes()[:, 1:3].sum(1)  # differing pairs count as crashes do
         may_differ = np.maximum(pairs.ends[:, FAILED].sum(1), pairs.ends[:, :, FAILED].sum(1))
         counts = tests, differing, np.minimum(may_differ, tests - differing)
         return self._next(counts, lambda: pairs.within().rhw(LEVEL), partial(pairs.spread, LEVEL))
 
     def used_of_pool(self, pairs: Pairs) -> float:
-        """Largest share of a pool's events of a stratum that these pairs have used."""
+        """Largest share of a stratum's events in the pool that these pairs have used."""
         return float(np.max(pairs.tests / np.maximum(self._available, 1)))
 
 
 class HourRounds(SideBySide):
-    """Says which tests of each family are driven next.
+    """Rounds of tests of several families.
 
-    The next test goes where it narrows the crashes per hour of the sum most; where each family's own rate is asked for,
-    it is of the one that is known worst.
+    Tests go where they narrow the sum's crashes per hour most; where each family's own rate is asked for, to the family
+    whose rate is known worst.
     """
 
     def __init__(self, campaign: Campaign, hour: PerHour, available: Sequence[IntArray], rule: RoundRule) -> None:
-        designs = [of.seen.design for of in hour.families]
-        super().__init__(campaign, designs, np.concatenate([of.p for of in hour.families]), available, rule)
-        own = zip(designs, available, strict=True) if campaign.stop.each_family else ()
-        self._own = [Allocation.of(campaign.testing.shells, *each) for each in own]
+        designs = [family.seen.design for family in hour.families]
+        super().__init__(campaign, designs, np.concatenate([family.p for family in hour.families]), available, rule)
+        shells, own = campaign.testing.shells, zip(designs, available, strict=True)
+        self._own = [Allocation.of(shells, *family) for family in own] if campaign.stop.each_family else []
 
     def next_round(self, hour: PerHour) -> list[IntArray]:
         """Tests to add per stratum of each family; all 0 when no stratum or no budget is left."""
-        tallies = [of.tally for of in hour.families]
+        tallies = [family.tally for family in hour.families]
         if self._own and all(tally.tests.any() for tally in tallies):
-            worst = int(np.argmax([of.limits(LEVEL).rhw for of in hour.families]))
-            of_each = [np.zeros_like(tally.tests) for tally in tallies]
-            of_each[worst] = self._own[worst].next_round(tallies[worst], self._budget - hour.totals[0])
-            return of_each
-        columns = [np.concatenate(column) for column in zip(*(each[:3] for each in tallies), strict=True)]
-        return self._next(columns, lambda: hour.limits(LEVEL, LIBRARY_STATEMENT).rhw)
+            worst = int(np.argmax([family.limits(LEVEL).rhw for family in hour.families]))
+            added = [np.zeros_like(tally.tests) for tally in tallies]
+            added[worst] = self._own[worst].next_round(tallies[worst], self._budget - hour.totals[0])
+            return added
+        counts = [np.concatenate(column) for column in zip(*(tally[:3] for tally in tallies), strict=True)]
+        return self._next(counts, lambda: hour.limits(LEVEL, LIBRARY_STATEMENT).rhw)
 
 
 def round_requests(
@@ -374,8 +377,8 @@ def round_requests(
 ) -> list[ShardRequest]:
     """Divide a round into shards, each a range of the round's tests in the order of strata.
 
-    ``tests`` and ``added``, shape (S,), are draws taken so far and those of the round; ``index`` and ``first_episode``
-    are the first shard's, ``shard_size`` the most episodes of one.
+    ``tests`` (S,) are drawn so far, ``added`` (S,) are the round's; ``index`` and ``first_episode`` are the first
+    shard's, ``shard_size`` is the most episodes of one.
     """
     total = int(added.sum())
     n_shards = max(-(-total // shard_size), min(MOST_SHARDS_PER_ROUND, total // SMALLEST_SHARD), 1)
