@@ -144,47 +144,47 @@ class AvCheck(ShownInPython):
         return finite_json({**asdict(self), "deterministic": not self.differing, "exit_code": self.exit_code})
 
 
-def verdict(found: AvCheck) -> str:
+def verdict(check: AvCheck) -> str:
     """What is to be done next, in a sentence."""
-    n, seen = found.n_episodes, found.behaviour
-    if found.failures:
-        return f"NOT READY: {sum(found.failures.values())} of {n} tests failed: {next(iter(found.failures))}."
-    if found.differing:
-        return f"NOT REPRODUCIBLE: {len(found.differing)} of {n} tests differed when run again. {cause(found)}"
-    if doubt := next(_doubts(found), None):
+    n, behaviour, speed = check.n_episodes, check.behaviour, check.speed
+    if check.failures:
+        return f"NOT READY: {sum(check.failures.values())} of {n} tests failed: {next(iter(check.failures))}."
+    if check.differing:
+        return f"NOT REPRODUCIBLE: {len(check.differing)} of {n} tests differed when run again. {cause(check)}"
+    if doubt := next(_doubts(check), None):
         return f"LOOK AGAIN: {doubt}"
-    slower, speed, advice = found.speed.us_per_step / found.idm_speed.us_per_step, found.speed, "."
+    advice = "."
     if speed.us_per_step > 100.0:  # which slows a run; in Python it is some 15
-        advice = f", {slower:.0f} times as long as IDM’s."
+        advice = f", {speed.us_per_step / check.idm_speed.us_per_step:.0f} times as long as IDM’s."
     if speed.construction_s > SLOW_S and speed.constructions > 1:
         advice += (
             f" Its constructor takes {speed.construction_s:.1f} s, and each worker of a run calls it "
             f"{speed.constructions} times: what all may share, load once (`load`, see docs/controllers.md)."
         )
-    if found.shows and found.source == "controller" and not seen.n_took_over_early:
-        advice += f" But {late_words(script=found.script)}."
+    if check.shows and check.source == "controller" and not behaviour.n_took_over_early:
+        advice += f" But {late_words(script=check.script)}."
     shows = int(1.0 / clopper_pearson(0, n, 0.1)[1])  # with 90 % confidence
-    rare = "" if found.source == "model" else f" (a fault in fewer than 1 of {shows} tests may not show: --tests)"
+    rare = "" if check.source == "model" else f" (a fault in fewer than 1 of {shows} tests may not show: --tests)"
     return (
-        f"READY: {n} tests twice, the same bits{rare}; it braked after {seen.braking_share:.0%} of {seen.n_events} "
-        f"{found.events}, {seen.reaction_s:.1f} s after they began (median; some leave time to wait); "
-        f"it takes {speed.us_per_step:.1f} µs a step{advice}"
+        f"READY: {n} tests twice, the same bits{rare}; it braked after {behaviour.braking_share:.0%} of "
+        f"{behaviour.n_events} {check.events}, {behaviour.reaction_s:.1f} s after they began (median; some leave time "
+        f"to wait); it takes {speed.us_per_step:.1f} µs a step{advice}"
     )
 
 
-def _doubts(found: AvCheck) -> Iterator[str]:
+def _doubts(check: AvCheck) -> Iterator[str]:
     """What makes tests of the vehicle say little, the worst first."""
-    seen, follows = found.behaviour, found.follows
-    if not (seen.n_events and seen.braking_share > 0.0 and seen.min_acceleration_mps2 <= -BRAKED_MPS2):
+    behaviour, follows = check.behaviour, check.follows
+    if not (behaviour.n_events and behaviour.braking_share > 0.0 and behaviour.min_acceleration_mps2 <= -BRAKED_MPS2):
         yield NEVER_BRAKED
     if follows is not None and follows.n_hit:
-        yield f"in {follows.n_hit} of {found.n_episodes} tests it hit the vehicle ahead before anything happened."
-    if found.shows and seen.n_braked_before:
-        yield f"{cruise_words([BRAKES_BEFORE.format(seen.n_braked_before)], script=found.script)}."
+        yield f"in {follows.n_hit} of {check.n_episodes} tests it hit the vehicle ahead before anything happened."
+    if check.shows and behaviour.n_braked_before:
+        yield f"{cruise_words([BRAKES_BEFORE.format(behaviour.n_braked_before)], script=check.script)}."
     if follows is not None and follows.headway_s > FAR_BEHIND_S:
         behind = f"{follows.headway_s:.1f} s behind the vehicle ahead"
         yield f"when the event begins it is {behind}, which makes that milder: let it keep up."
-    longest, moved = max(found.moved_mps2.items(), default=(0.0, 0.0))
+    longest, moved = max(check.moved_mps2.items(), default=(0.0, 0.0))
     if longest and moved > MOVES_MPS2:
         yield (
             f"its first answer moves by up to {moved:.1f} m/s² where the warm-up takes {longest:g} s. "
@@ -193,32 +193,31 @@ def _doubts(found: AvCheck) -> Iterator[str]:
         )
 
 
-def cause(found: AvCheck) -> str:
+def cause(check: AvCheck) -> str:
     """Why tests came out otherwise; empty if none did."""
-    if found.likely_cause is None:
+    if check.likely_cause is None:
         return ""
-    return CAUSES[found.likely_cause].format("; ".join(found.clock_read_at[:3]) or "in a library")
+    return CAUSES[check.likely_cause].format("; ".join(check.clock_read_at[:3]) or "in a library")
 
 
-def rows(found: AvCheck) -> list[dict[str, Any]]:
+def rows(check: AvCheck) -> list[dict[str, Any]]:
     """A table: what was found, beside the built-in IDM."""
-    told = found.to_json()
-    of_following = {} if found.follows is None else FOLLOWING
-    own, idm = ({**told[f"{who}behaviour"], **told[f"{who}speed"]} for who in ("", "idm_"))
-    kind = f"{found.events} that take time" if found.shows else f"{found.events} of one step"
-    kind = found.events if found.follows is not None else kind
-    where = "twin (the motion that SUMO would compute)" if found.engine == "twin" else "SUMO"
+    content = check.to_json()
+    own, idm = ({**content[f"{who}behaviour"], **content[f"{who}speed"]} for who in ("", "idm_"))
+    follows = check.follows is not None
+    kind = check.events if follows else f"{check.events} {'that take time' if check.shows else 'of one step'}"
+    where = "twin (the motion that SUMO would compute)" if check.engine == "twin" else "SUMO"
     shown = [
-        ("kind of vehicle; where tested; on what", f"{found.source}; {where}; {kind}, {found.method}", ""),
-        ("tests", found.n_episodes, ""),
-        *([(f"failed: {why}", n, "") for why, n in told["failures"].items()] or [("tests that failed", "none", "")]),
-        ("tests that differed when run again", told["differing"] or "none", ""),
-        ("accelerations allowed, m/s²", [*told["limits_mps2"]], ""),
-        *((text.format(events=found.events), own[name], idm[name]) for name, text in IN_WORDS.items()),
-        *((text, told["follows"][name], told["idm_follows"][name]) for name, text in of_following.items()),
+        ("kind of vehicle; where tested; on what", f"{check.source}; {where}; {kind}, {check.method}", ""),
+        ("tests", check.n_episodes, ""),
+        *([(f"failed: {why}", n, "") for why, n in content["failures"].items()] or [("tests that failed", "none", "")]),
+        ("tests that differed when run again", content["differing"] or "none", ""),
+        ("accelerations allowed, m/s²", [*content["limits_mps2"]], ""),
+        *((text.format(events=check.events), own[name], idm[name]) for name, text in IN_WORDS.items()),
+        *((FOLLOWING[name], value, content["idm_follows"][name]) for name, value in (content["follows"] or {}).items()),
         *(
             (f"how much its first answer moves with a warm-up of {s:g} s, at most, m/s²", moved, "")
-            for s, moved in found.moved_mps2.items()
+            for s, moved in check.moved_mps2.items()
         ),
     ]
     return [dict(zip(("what", "found", "built-in IDM"), row, strict=True)) for row in shown]

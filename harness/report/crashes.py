@@ -63,21 +63,21 @@ def worst_crashes(key: FloatArray, episode: FloatArray, among: BoolArray) -> lis
 
 
 def crash_gallery(run: RunFolder, summary: RunSummary) -> tuple[list[GalleryRow], list[Scene]]:
-    """Crashes that the reference driver avoids, the hardest impacts, typical ones, those of the largest weights.
+    """Crashes that the reference driver avoids, the hardest impacts, typical ones, and those of the largest weights.
 
-    Of shells the outermost in place of the latter. Crashes that nobody avoids are left out, unless there are no others.
-    Traced crashes go first where some of the worst have no trace: a scene is worth more than a rank.
+    In a run of shells those of the outermost shells take the place of the last. Crashes that nobody avoids are left
+    out, unless there are no others. A traced crash goes before a worse one without a trace: it can be watched.
     """
     crashes, scenes, family = summary.crashes, Scenes(run.campaign, run.traffic), run.family
     facts = [each.of(crashes) for each in shown_of(family)]
-    told = list(zip(shown_of(family), facts, strict=True))[:2]
+    first_facts = list(zip(shown_of(family), facts, strict=True))[:2]
     episode = crashes["episode"]
     ends = _ends(run, scenes, episode, crashes["impact_speed_mps"])
     avoided = (ends < 0) & (ends != UNKNOWN)
     stand_in = next(iter(family.stand_ins), "")
     rankings = _rankings(summary, stand_in, avoided, avoided.any(axis=1) | (ends == UNKNOWN).any(axis=1))
-    asked = {int(episode[place]) for ranked in rankings.values() for place in ranked}
-    traces = run.traces(asked)
+    episodes = {int(episode[place]) for ranked in rankings.values() for place in ranked}
+    traces = run.traces(episodes)
     traced = set() if traces is None else set(traces.column("episode").unique().to_pylist())
     reasons: dict[int, list[str]] = {}
     for reason, ranked in rankings.items():
@@ -91,30 +91,33 @@ def crash_gallery(run: RunFolder, summary: RunSummary) -> tuple[list[GalleryRow]
     for place, why in reasons.items():
         crash = {name: float(column[place]) for name, column in crashes.items()}
         number, component = int(episode[place]), int(crashes["component"][place])
-        avoid = [name for name, avoids in zip(family.stand_ins, avoided[place], strict=True) if avoids]
-        by, scene = ", ".join(avoid) or ("nobody" if (ends[place] != UNKNOWN).all() and ends.size else "–"), None
+        all_known = ends.size and (ends[place] != UNKNOWN).all()
+        names_of = [name for name, avoids in zip(family.stand_ins, avoided[place], strict=True) if avoids]
+        avoiders = ", ".join(names_of) or ("nobody" if all_known else "–")
+        scene = None
         if traces is not None and number in traced:
             impact, scene = tenths(crash["impact_speed_mps"]), len(shown)
-            row, trace = (each.filter(pc.equal(each["episode"], number)) for each in (stored, traces))
-            event = " and ".join(f"{each.words} {tenths(float(of[place]))} {each.unit}" for each, of in told)
-            kinds = ", ".join(each.rpartition(" no. ")[0] for each in why)
+            row, trace = (table.filter(pc.equal(table["episode"], number)) for table in (stored, traces))
+            event = " and ".join(f"{fact.words} {tenths(float(x[place]))} {fact.unit}" for fact, x in first_facts)
+            kinds = ", ".join(reason.rpartition(" no. ")[0] for reason in why)
             shown.append(scenes.scene(row, trace, why=f"{event}, impact at {impact} m/s ({kinds})"))
         share = crash["weight"] / total if total > 0.0 else math.nan
-        shown_facts = [float(each[place]) for each in facts]
         drawn_by = names[component] if 0 <= component < len(names) else "–"
-        rows.append(GalleryRow(number, crash, shown_facts, ", ".join(why), share, drawn_by, by, scene))
+        values = [float(column[place]) for column in facts]
+        rows.append(GalleryRow(number, crash, values, ", ".join(why), share, drawn_by, avoiders, scene))
     return rows, shown
 
 
 def _rankings(summary: RunSummary, stand_in: str, avoided: BoolArray, someone: BoolArray) -> dict[str, list[int]]:
-    """Places of crashes by what they are shown for; who ``avoided`` (n, D) them, the first of whom is the ``stand_in``.
+    """Places of crashes by what they are shown for.
 
-    ``someone`` (n,) may have.
+    ``avoided`` (n, D) says which drivers avoid them, the first of whom is the ``stand_in``; ``someone`` (n,) whether
+    any of them may have.
     """
     crashes, among = summary.crashes, someone if someone.any() else ~someone
     episode, impact, weight = (crashes[name] for name in ("episode", "impact_speed_mps", "weight"))
-    known = someone.any() and (avoided.any(1) == someone).all()
-    hardest = "hardest avoidable" if known else "hardest"
+    all_known = someone.any() and (avoided.any(1) == someone).all()
+    hardest = "hardest avoidable" if all_known else "hardest"
     keys = {hardest: impact, "typical": -np.abs(impact - weighted_quantiles(impact, weight, (0.5,))[0])}
     if summary.from_shells:
         keys["outermost"] = crashes["component"]
@@ -125,13 +128,13 @@ def _rankings(summary: RunSummary, stand_in: str, avoided: BoolArray, someone: B
 
 
 def _ends(run: RunFolder, scenes: Scenes, episode: FloatArray, impact: FloatArray) -> IntArray:
-    """After which step the family's `stand_ins` crash where the AV has (n, D), below zero for never."""
+    """The step after which the family's `stand_ins` crash in the AV's place (n, D), below zero for never."""
     ends = np.full((episode.size, len(run.family.stand_ins)), UNKNOWN, np.int64)
     acts = run.campaign.av.acts_before_event
     judged = np.sort(np.argsort(-impact, kind="stable")[: MOST_TRACED if acts else MOST_JUDGED])
-    asked = {int(each) for each in episode[judged]}
-    if asked:
-        ends[judged] = scenes.ends(run.crashes(asked), run.traces(asked) if acts else None)
+    episodes = {int(each) for each in episode[judged]}
+    if episodes:
+        ends[judged] = scenes.ends(run.crashes(episodes), run.traces(episodes) if acts else None)
     return ends
 
 
@@ -164,21 +167,21 @@ class CrashPairs(NamedTuple):
 def crashing_pairs(runs: Sequence[RunFolder], shells: Sequence[dict[str, Any]]) -> CrashPairs:
     """Pairs on which A or B crashes, by the records: the i-th test of a shell of A and of B."""
     axes = runs[0].family.maps[0]
-    n_pairs, found = [shell["n_pairs"] for shell in shells], []
+    n_pairs, columns = [shell["n_pairs"] for shell in shells], []
     for run in runs:
         rows = summarise(run).rows
-        first = [np.flatnonzero(rows["component"] == s)[:n] for s, n in enumerate(n_pairs)]
-        if [each.size for each in first] != n_pairs:
+        paired = [np.flatnonzero(rows["component"] == s)[:n] for s, n in enumerate(n_pairs)]
+        if [each.size for each in paired] != n_pairs:
             raise RunFolderError(str(run.path), "fewer tests than pairs", f"those of {COMPARISON}", COMPARE_AGAIN)
-        found.append({name: column[np.concatenate(first)] for name, column in rows.items()})
-    a, b = (each["outcome"] == CRASH for each in found)
-    kept = a | b
-    of_map = np.stack([np.where(a, axis.of(found[0]), axis.of(found[1]))[kept] for axis in axes])
-    episode = np.stack([np.where(each["outcome"] == FAILED, -1.0, each["episode"])[kept] for each in found])
-    impact = np.stack([each["impact_speed_mps"][kept] for each in found])
+        columns.append({name: column[np.concatenate(paired)] for name, column in rows.items()})
+    a, b = (each["outcome"] == CRASH for each in columns)
+    crashed = a | b
+    values = np.stack([np.where(a, axis.of(columns[0]), axis.of(columns[1]))[crashed] for axis in axes])
+    episode = np.stack([np.where(each["outcome"] == FAILED, -1.0, each["episode"])[crashed] for each in columns])
+    impact = np.stack([each["impact_speed_mps"][crashed] for each in columns])
     weight = np.repeat(weight_of_a_test(np.array([shell["p"] for shell in shells]), np.array(n_pairs)), n_pairs)
-    who = np.where(a & b, 0, np.where(a, 1, 2))[kept]
-    return CrashPairs(who, weight[kept], of_map, episode.astype(np.int64), impact)
+    who = np.where(a & b, 0, np.where(a, 1, 2))[crashed]
+    return CrashPairs(who, weight[crashed], values, episode.astype(np.int64), impact)
 
 
 def scenes_of(runs: Sequence[RunFolder], pairs: CrashPairs, replay: Replay) -> Iterator[Scene]:
@@ -188,14 +191,14 @@ def scenes_of(runs: Sequence[RunFolder], pairs: CrashPairs, replay: Replay) -> I
         places = np.flatnonzero((pairs.who == 1 + side) & (pairs.episode[other] >= 0))
         for place in places[np.argsort(-impact[places], kind="stable")][:SHOWN_ALONE]:
             episodes = [int(each) for each in pairs.episode[:, place]]
-            told = f"{tenths(float(impact[place]))} m/s"
+            speed = f"{tenths(float(impact[place]))} m/s"
             row, trace = motion_of(runs[side], episodes[side], replay)
-            if trace is None:
+            if trace is None:  # nothing to watch
                 continue
             scene = Scenes(runs[side].campaign, None).scene(row, trace)
             scene = beside_other(scene, name, "AB"[other], motion_of(runs[other], episodes[other], replay)[1])
-            where = " and ".join(f"test {count(n)} of {of}" for n, of in zip(episodes, "AB", strict=True))
-            yield {**scene, "episode": f"only {name}, {told}", "title": f"Only {name} crashes, at {told} ({where})"}
+            where = " and ".join(f"test {count(n)} of {side_name}" for n, side_name in zip(episodes, "AB", strict=True))
+            yield {**scene, "episode": f"only {name}, {speed}", "title": f"Only {name} crashes, at {speed} ({where})"}
 
 
 def motion_of(run: RunFolder, episode: int, replay: Replay) -> tuple[pa.Table, pa.Table | None]:

@@ -45,10 +45,10 @@ class PlotAxis(NamedTuple):
 
     def place(self, values: ArrayLike) -> FloatArray:
         """Where values are between the ends, 0 to 1; what is not finite is not there."""
-        low, high, at = self.low, self.high, np.asarray(values, np.float64)
+        low, high, numbers = self.low, self.high, np.asarray(values, np.float64)
         if self.log:
-            low, high, at = math.log10(low), math.log10(high), np.log10(np.maximum(at, 1e-300))
-        return np.asarray(np.clip((at - low) / (high - low), -99.0, 99.0), np.float64)
+            low, high, numbers = math.log10(low), math.log10(high), np.log10(np.maximum(numbers, 1e-300))
+        return np.asarray(np.clip((numbers - low) / (high - low), -99.0, 99.0), np.float64)
 
     def ticks(self) -> list[tuple[float, str]]:
         """Values and texts: powers of ten, also their multiples by 2 and 5 where there are few; or round numbers."""
@@ -216,8 +216,8 @@ def _drawn(mark: Mark, panel: PlotPanel, width: float, height: float) -> str:
 
 
 def _joined(x: FloatArray, y: FloatArray) -> str:
-    known = np.isfinite(x) & np.isfinite(y)
-    return "M" + "L".join(f"{a:.1f} {b:.1f}" for a, b in zip(x[known], y[known], strict=True))
+    finite = np.isfinite(x) & np.isfinite(y)
+    return "M" + "L".join(f"{a:.1f} {b:.1f}" for a, b in zip(x[finite], y[finite], strict=True))
 
 
 def _style(mark: Mark) -> str:

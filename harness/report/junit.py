@@ -40,12 +40,12 @@ def statement_case(content: dict[str, Any], message: str, asked: str, exit_code:
     It fails where a test has refuted it. Where there is no such statement, as under other methods than shells, the
     answer itself decides: a gate in which nothing does would let everything pass. What was not asked is not told.
     """
-    name, found = "crashes per hour", dict[str, Any]()
+    name, within = "crashes per hour", dict[str, Any]()
     if "families" not in content:
         name, answer = "crash rate", content["estimates"][content["headline"]]
-        found = answer.get("details", {}).get("within") or {}
-    asks = bool(found) and asked == LIBRARY_STATEMENT
-    outcome = "failure" if asks and found["refuted"] else OUTCOMES.get(exit_code, "failure")
+        within = answer.get("details", {}).get("within") or {}
+    asks = bool(within) and asked == LIBRARY_STATEMENT
+    outcome = "failure" if asks and within["refuted"] else OUTCOMES.get(exit_code, "failure")
     if (decision := content.get("decision")) is not None:
         name += f" below {limit_words(decision)}"
     return Case(f"{name}, given the {LIBRARY_STATEMENT}" if asks else name, message, outcome)
@@ -65,13 +65,13 @@ def write_junit(path: Path, suite: str, case: Case, attachments: Sequence[Path])
     of_suite = ET.SubElement(root, "testsuite", {"name": suite, "tests": "1", **counted})
     element = ET.SubElement(of_suite, "testcase", classname=suite, name=case.name)
     attached = [f"[[ATTACHMENT|{each.resolve()}]]" for each in attachments]
-    told = [case.message] if case.outcome == "passed" else []
-    if not told:
+    output = [case.message] if case.outcome == "passed" else []
+    if not output:
         rows = case.message.replace("\n    ", " ").splitlines()[:2] or [""]  # those too long go on below
         what, *parts = re.split(" {2,}", rows[-1].strip())  # cells of a row
-        told_as = case.verdict or ": ".join(filter(None, [what, ", ".join(parts)]))
-        ET.SubElement(element, case.outcome, message=told_as).text = case.message
-    ET.SubElement(element, "system-out").text = "\n".join([*told, *attached, ""])
+        message = case.verdict or ": ".join(filter(None, [what, ", ".join(parts)]))
+        ET.SubElement(element, case.outcome, message=message).text = case.message
+    ET.SubElement(element, "system-out").text = "\n".join([*output, *attached, ""])
     ET.indent(root)
     text = printable(ET.tostring(root, encoding="unicode", xml_declaration=True))
     write_bytes(path, f"{text}\n".encode())

@@ -55,7 +55,7 @@ def write_motion(result: ReplayResult, file: str | Path) -> Sequence[Path]:
 
 
 def writer_of(file: Path) -> Callable[[ReplayResult, Path], list[Path] | None]:
-    """What writes files of this name, and returns them if they are several; raises as `write_motion` does."""
+    """The function that writes files of this suffix, and returns them if they are several; raises as `write_motion`."""
     if file.suffix in WRITERS:
         return WRITERS[file.suffix]
     if file.suffix != ".xosc":
@@ -84,10 +84,10 @@ def write_floating_car_data(result: ReplayResult, file: Path) -> None:
         x, v, lane = (track.column(column).to_pylist() for column in ("x_m", "v_mps", "lane"))
         middle = SUMO_LANE_M * (0.5 - share_over(track)[: len(x)])
         y = np.where(np.asarray(lane) == 1, np.maximum(middle, INSIDE_M), np.minimum(middle, -INSIDE_M)).tolist()
-        for step, (at, left, speed, on) in enumerate(zip(x, y, v, lane, strict=True)):
+        for step, (x_m, y_m, v_mps, index) in enumerate(zip(x, y, v, lane, strict=True)):
             frames.setdefault(step, []).append(
-                f'<vehicle id={quoteattr(name)} x="{at!r}" y="{left!r}" angle="90.00" type={quoteattr(name)} '
-                f'speed="{speed!r}" pos="{at!r}" lane="cell0_{on}" slope="0.00"/>'
+                f'<vehicle id={quoteattr(name)} x="{x_m!r}" y="{y_m!r}" angle="90.00" type={quoteattr(name)} '
+                f'speed="{v_mps!r}" pos="{x_m!r}" lane="cell0_{index}" slope="0.00"/>'
             )
     lines: list[str] = []
     for step, vehicles in sorted(frames.items()):
@@ -103,7 +103,7 @@ def write_sumo(result: ReplayResult, file: Path) -> list[Path]:
     first, last = scene["first"], max(map(len, tracks.values())) - 1
     onset = first if scene["onset"] is None else scene["onset"]
     write_bytes(files[0], network_file(1).read_bytes())
-    # The device lets vehicles begin as fast as their type may be; what they are told later may be more.
+    # The device lets vehicles begin no faster than maxSpeed; later in the replay they may be faster.
     types = [
         f'<vType id={quoteattr(name)} color="{COLOURS.get(name, OTHERS)}" length="5" minGap="0" accel="100" '
         f'decel="100" emergencyDecel="100" sigma="0" tau="0.1" speedDev="0" '
@@ -121,7 +121,7 @@ def write_sumo(result: ReplayResult, file: Path) -> list[Path]:
         f'<viewport x="{left + width / 2:.1f}" y="0" zoom="{100 * ROAD_M / width:.0f}"/>',
     ]  # fmt: skip
     _write(files[3], "viewsettings", looks)
-    # It may go one step beyond the last: where its time is up, sumo-gui asks whether to close, in front of the crash.
+    # One step beyond the last: when its time is up sumo-gui asks whether to close, and its box would hide the crash.
     halts = ",".join(f"{step * STEP_S:.1f}" for step in (onset, last))
     settings = {
         "input": f"<net-file value={network}/><additional-files value={vehicles}/>",

@@ -123,8 +123,9 @@ class _Words(Formatter):
 
 def note_words(note: Note | Mapping[str, Any]) -> str:
     """A note, or one from JSON, in words."""
-    of = note if isinstance(note, Note) else Note(**note)
-    return _Words().vformat(NOTES.get(of.key, of.key.replace("{", "{{").replace("}", "}}")), (), of.numbers)
+    note = note if isinstance(note, Note) else Note(**note)
+    own = note.key.replace("{", "{{").replace("}", "}}")  # of an estimator of one's own: the sentence itself
+    return _Words().vformat(NOTES.get(note.key, own), (), note.numbers)
 
 
 def method_words(estimate: Estimate, estimator: str) -> str:

@@ -38,7 +38,10 @@ def write_page_of(run: RunFolder) -> Path:
         outcomes=list(zip(OUTCOMES, summary.count, summary.weight, strict=True)),
         estimators=sorted(run.estimates.estimates.items(), key=lambda item: item[0] != run.estimates.headline),
         warnings=[*answer.warnings, *uncovered(run, summary)],
-        diagnostics=[of for of in leaves(run.estimates.diagnostics) if run.shells is None or of[1] not in (None, {})],
+        diagnostics=[
+            (name, value) for name, value in leaves(run.estimates.diagnostics)
+            if run.shells is None or value not in (None, {})
+        ],
         settings=dump_campaign(run.campaign), folder=typed(run.path),
     )  # fmt: skip
 
@@ -59,11 +62,11 @@ def write_comparison(folder: Path, stored: dict[str, Any], runs: Sequence[RunFol
     pairs, campaign = crashing_pairs(runs, stored["shells"]), runs[0].campaign
     family = runs[0].family
     answers = [short_answer(run.campaign, run.manifest, run.estimates) for run in runs]
-    of_each = [{row.key: row for row in answer.rows} for answer in answers]
+    rows_of_each = [{row.key: row for row in answer.rows} for answer in answers]
     shown = {"ratio": "× competent driver", "impact": "impact"}
     return _write_comparison(
         folder, stored, [(answer.vehicle, answer.parameters) for answer in answers],
-        [(what, [rows.get(key) for rows in of_each]) for key, what in shown.items()],
+        [(what, [rows.get(key) for rows in rows_of_each]) for key, what in shown.items()],
         above=campaign.crash.counts_above_mps, level=campaign.environment.lane_change_level,
         family=family, words=family.words, plot=pairs.plot(family),
         scenes=list(scenes_of(runs, pairs, replay)), counts=pairs.counts,
@@ -74,23 +77,23 @@ def write_comparison_of_sum(folder: Path, stored: dict[str, Any]) -> Path:
     """Write the page of a comparison in several scenarios: the sum, and the way to each one's own page."""
     beside = [several.beside_row("", stored[side]["beside"], seen=stored[side]["n_crashes"] > 0) for side in "ab"]
     scenarios = [
-        (several.called(name), name, of, several.ratio_words(of), several.pair_words(of["decision"]))
-        for name, of in stored["families"].items()
+        (several.called(name), name, pair, several.ratio_words(pair), several.pair_words(pair["decision"]))
+        for name, pair in stored["families"].items()
     ]
-    vehicles = [(of["label"], ()) for of in stored["campaigns"].values()]
+    vehicles = [(campaign["label"], ()) for campaign in stored["campaigns"].values()]
     return _write_comparison(folder, stored, vehicles, [("× competent driver", beside)], above=0.0, scenarios=scenarios)
 
 
 def _write_comparison(
     folder: Path, stored: dict[str, Any], vehicles: Iterable[tuple[Any, ...]], rows: Sequence[Any], **content: Any
 ) -> Path:
-    """Write either page; ``rows`` are what its table has besides, of A and of B."""
+    """Write the page of either comparison; ``rows`` are further rows of its table, with cells for A and for B."""
     asked, sides = several.pair_asked(stored), zip("AB", vehicles, strict=True)
     return write_page(
         folder / "report.html", "compare.html.j2",
         compared=stored, asked=asked, given=asked is not stored, ratio=several.ratio_words(asked),
         verdict=several.pair_words(stored["decision"]), to_decide=several.deciding_words(stored),
-        warnings=list(several.pair_warnings(stored)), vehicles=[(name, *of) for name, of in sides],
+        warnings=list(several.pair_warnings(stored)), vehicles=[(name, *vehicle) for name, vehicle in sides],
         rates=[several.rates_of(stored[side]) for side in "ab"],
         rows=rows, **content,
     )  # fmt: skip
@@ -107,12 +110,12 @@ def _plots(run: RunFolder, summary: RunSummary) -> list[Plot]:
     return [plot for plot in plots if plot is not None]
 
 
-def _sensitivity(folder: Path, known_by: str, typed: str) -> Plot | None:
-    """What `harness sensitivity` has found of these tests; None where it has not, or of others."""
+def _sensitivity(folder: Path, campaign_hash: str, typed: str) -> Plot | None:
+    """Plot of what `harness sensitivity` has found; None where it has not been run, or on tests of another campaign."""
     if not (file := folder / SENSITIVITY).is_file():
         return None
-    found = read_as(Sensitivity, file, mend=f"Make it again with `harness sensitivity {typed}`.")
-    return sensitivity_plot(found) if found.campaign_hash == known_by and found.shown else None
+    sensitivity = read_as(Sensitivity, file, mend=f"Make it again with `harness sensitivity {typed}`.")
+    return sensitivity_plot(sensitivity) if sensitivity.campaign_hash == campaign_hash and sensitivity.shown else None
 
 
 def _write_plots(folder: Path, plots: list[Plot]) -> None:
@@ -130,5 +133,5 @@ def uncovered(run: RunFolder, summary: RunSummary) -> list[str]:
     n_tests, n_estimated = summary.n_episodes, run.estimates.n_episodes
     if n_estimated in (n_tests, n_tests - int(summary.count[FAILED])):
         return []
-    found = f"the estimates cover {count(n_estimated)} tests but the records hold {count(n_tests)}"
-    return [f"{found}: run harness estimate {typed(run.path)} --write"]
+    message = f"the estimates cover {count(n_estimated)} tests but the records hold {count(n_tests)}"
+    return [f"{message}: run harness estimate {typed(run.path)} --write"]

@@ -77,10 +77,7 @@ class Scenes:
         self._family, self._environment = family_named(campaign.scenario), environment
 
     def ends(self, rows: pa.Table, traces: pa.Table | None) -> IntArray:
-        """After which step each stand-in runs into the principal vehicle in episodes with an event (n, D); or below 0.
-
-        Negative is never, or `UNKNOWN`.
-        """
+        """Step after which each stand-in runs into the principal vehicle (n, D); below 0 for never, or `UNKNOWN`."""
         shape = rows.num_rows, len(self._family.stand_ins)
         if self._environment is None or 0 in shape:
             return np.full(shape, UNKNOWN)
@@ -89,10 +86,10 @@ class Scenes:
     def _drive(
         self, environment: Environment, rows: pa.Table, traces: pa.Table | None, *, last: bool = False
     ) -> Driven:
-        """The same, with the motion on the last of them."""
+        """What the stand-ins do in these episodes; with the motion in the ``last`` of them."""
         chosen, start = chosen_from(rows, self._family), np.full((rows.num_rows, 2), np.nan)
         if traces is not None:
-            episode, step, x, v = (floats(_of(traces, "AV").column(name)) for name in ("episode", "step", *MOTION))
+            episode, step, x, v = (floats(_rows_of(traces, "AV").column(name)) for name in ("episode", "step", *MOTION))
             row = np.searchsorted(floats(rows.column("episode")), episode)
             begins = step == self._family.onset(environment, chosen)[row] + 1
             start[row[begins]] = np.stack((x, v), axis=1)[begins]
@@ -104,15 +101,16 @@ class Scenes:
         return driven
 
     def scene(self, row: pa.Table, trace: pa.Table, *, why: str = "") -> Scene:
-        """One episode, given its row and its trace, from shortly before the event on; all of one without."""
+        """The scene of one episode, given its row and its trace: from shortly before the event on, if it has one."""
         trace = with_lateral(row, trace, self._family, self._environment)
         episode, outcome, cut = (row.column(name)[0].as_py() for name in ("episode", "outcome", "event_step"))
-        rows = [(name, _of(trace, name)) for name in self._family.vehicles]
-        tracks = [{"name": name, **_states(of), "crash": None, "over": share_over(of)} for name, of in rows]
+        rows = [(name, _rows_of(trace, name)) for name in self._family.vehicles]
+        tracks = [{"name": name, **_states(own), "crash": None, "over": share_over(own)} for name, own in rows]
         bv, av = tracks[self._family.principal], tracks[-1]
         last = av["x"].size - 1
         av["crash"] = last if outcome == "crash" else None
-        first, onset, ghosts, seen = 0, None, list[Scene](), list[tuple[int, str]]()
+        first, onset = 0, None
+        ghosts, appearances = list[Scene](), list[tuple[int, str]]()
         if cut is not None and cut < last:
             chosen = chosen_from(row, self._family)
             onset = int(onset_steps(chosen.at, chosen.lead)[0])
@@ -120,75 +118,76 @@ class Scenes:
                 onset = int(self._family.onset(self._environment, chosen)[0])
                 ghosts = self._ghosts(self._environment, row, trace, onset, bv, av)
                 from_step = self._family.script(self._environment, chosen).visible_from[0].tolist()
-                hidden = zip(from_step, self._family.vehicles, strict=False)
-                seen = [(step, f"{name} becomes visible") for step, name in hidden if 0 < step <= last]
+                appear = zip(from_step, self._family.vehicles, strict=False)
+                appearances = [(step, f"{name} becomes visible") for step, name in appear if 0 < step <= last]
             first = max(min(onset - BEFORE, last - FEWEST), 0)
-        for each in (*tracks, *ghosts):
-            each |= {key: each[key][first:] for key in "xv"}
-            each["brakes"] = _brakes(each["v"], first)
-        for each in tracks:
-            over = each["over"][first:]
-            each["over"] = over if (over != over[0]).any() else over[:1]
+        for track in (*tracks, *ghosts):
+            track |= {key: track[key][first:] for key in "xv"}
+            track["brakes"] = _brakes(track["v"], first)
+        for track in tracks:
+            over = track["over"][first:]
+            track["over"] = over if (over != over[0]).any() else over[:1]
         words = self._family.words
         moments = [(cut, " ".join(words.happens)), (av["brakes"], "AV brakes"), (av["crash"], "crash")]
-        moments += [*seen, (onset, " ".join(words.shows))] if onset != cut else seen
+        moments += [*appearances, (onset, " ".join(words.shows))] if onset != cut else appearances
         scene = {
             "vehicle": self._vehicle, "scenario": self._family.name, "episode": episode,
             "title": f"Test {episode:,}: {why or outcome}",
             "first": first, "onset": onset, "event": cut, "principal": bv["name"],
             "apart": None if onset is None else first if self._family.follows else onset + 1,
             "tracks": tracks, "ghosts": ghosts,
-            "moments": sorted(each for each in moments if each[0] is not None),
+            "moments": sorted((step, name) for step, name in moments if step is not None),
         }  # fmt: skip
-        (of_test,) = row.to_pylist()
-        told = self._family.told(of_test) if onset is not None else ""
-        cause = of_test.get("failure")  # pages show none that failed
-        return {**scene, "facts": _facts(scene, told, cause and f"FAILS at {STEP_S * last:.1f} s: {cause}")}
+        (stored,) = row.to_pylist()
+        event_words = self._family.told(stored) if onset is not None else ""
+        cause = stored.get("failure")  # pages show none that failed
+        return {**scene, "facts": _facts(scene, event_words, cause and f"FAILS at {STEP_S * last:.1f} s: {cause}")}
 
     def _ghosts(
         self, environment: Environment, row: pa.Table, trace: pa.Table, onset: int, bv: Scene, av: Scene
     ) -> list[Scene]:
-        """Stand-ins along an episode from its begin; after a crash the one ahead goes on as long as they are shown."""
+        """Tracks of the stand-ins in an episode; ``bv`` goes on after the AV's crash as long as they are shown."""
         if not self._family.stand_ins:
             return []
         [end], motion, ahead = self._drive(environment, row, trace, last=True)
         last = shown = av["x"].size - 1
         if av["crash"] is not None:
             ends = zip(end, motion, strict=True)
-            shown = max(_over(last, int(ended), driven[:, 1], ahead[:, 1]) for ended, driven in ends)
+            shown = max(_last_shown(last, int(ended), driven[:, 1], ahead[:, 1]) for ended, driven in ends)
             bv["x"] = np.append(bv["x"], ahead[last + 1 : shown + 1, 0])
             bv["v"] = np.append(bv["v"], ahead[last + 1 : shown + 1, 1])
         ghosts = []
         for name, ended, driven in zip(self._family.stand_ins, end.tolist(), motion, strict=True):
-            there = np.flatnonzero(driven[:, 0])
-            begins, until = (int(there[0]), min(shown, int(there[-1]))) if there.size else (onset + 1, onset)
+            steps = np.flatnonzero(driven[:, 0])
+            begins, until = (int(steps[0]), min(shown, int(steps[-1]))) if steps.size else (onset + 1, onset)
             own = driven[begins : until + 1].T
-            begun = {key: np.append(av[key][:begins], own[k]) for k, key in enumerate("xv")}
-            ghosts.append({"name": name, **begun, "crash": ended if ended == until else None})
+            motion_of_it = {key: np.append(av[key][:begins], own[k]) for k, key in enumerate("xv")}
+            ghosts.append({"name": name, **motion_of_it, "crash": ended if ended == until else None})
         return ghosts
 
 
 def beside_other(scene: Scene, label: str, other: str, trace: pa.Table | None) -> Scene:
-    """The scene of a crash of the vehicle ``label``, and who met the same event without a crash, if it was traced.
+    """The scene of a crash of the vehicle ``label``, with the ``other`` as a ghost, which did not crash on this event.
 
-    The scene is one without ghosts. The vehicle ahead goes on after the crash as in the other's test.
+    The scene has no ghosts before. The vehicle ahead goes on after the crash as in the other's test, if that was
+    traced.
     """
     first, av, ghosts = scene["first"], scene["tracks"][-1], list[Scene]()
     bv = scene["tracks"][family_named(scene["scenario"]).principal]
-    told = {other: "does not crash; its motion is not on record, and it cannot be run again"}
+    endings = {other: "does not crash; its motion is not on record, and it cannot be run again"}
     if trace is not None:
-        ghost, goes_on = (_states(_of(trace, name)) for name in ("AV", bv["name"]))
+        ghost, goes_on = (_states(_rows_of(trace, name)) for name in ("AV", bv["name"]))
         crash = first + av["x"].size - 1
-        shown = _over(crash, -1, ghost["v"], goes_on["v"]) + 1
+        shown = _last_shown(crash, -1, ghost["v"], goes_on["v"]) + 1
         for key in "xv":
             bv[key] = np.append(bv[key], goes_on[key][crash + 1 : shown])
             ghost[key] = ghost[key][first:shown]
         ghosts.append(ghost | {"name": other, "crash": None, "brakes": _brakes(ghost["v"], first)})
-        told[other] = _ending(ghosts[0], scene)
+        endings[other] = _ending(ghosts[0], scene)
     facts = [(name.replace("AV", label), phrase) for name, phrase in scene["facts"]]
     moments = [(step, name.replace("AV", label)) for step, name in scene["moments"]]
     av["label"] = label
-    return {**scene, "ghosts": ghosts, "facts": [*facts, *told.items()], "moments": moments}
+    return {**scene, "ghosts": ghosts, "facts": [*facts, *endings.items()], "moments": moments}
 
 
 def _states(rows: pa.Table) -> dict[str, Any]:
@@ -196,9 +195,9 @@ def _states(rows: pa.Table) -> dict[str, Any]:
 
 
 def with_lateral(row: pa.Table, trace: pa.Table, family: Family, environment: Environment | None) -> pa.Table:
-    """The trace of an episode with how far the vehicle that leaves its lane has moved sideways, ``lateral_m``.
+    """The trace of an episode with ``lateral_m``, how far the vehicle that leaves its lane has moved sideways.
 
-    Records have it of vehicles that come over; where the environment is not known it is left out.
+    Where a vehicle comes over the records have it already; where the environment is not known it is left out.
     """
     if environment is None or "lateral_m" in trace.column_names or not row.column("event_step")[0].is_valid:
         return trace
@@ -213,9 +212,9 @@ def with_lateral(row: pa.Table, trace: pa.Table, family: Family, environment: En
 
 
 def share_over(track: pa.Table) -> FloatArray:
-    """Where a vehicle is between the left lane (0) and the right one (1) in each row of its trace, until it is over.
+    """Where a vehicle is between the left lane (0) and the right one (1), for each row of its trace and until it is over.
 
-    Where lane changes take time, one that comes over moves on as fast after the overlap, with which its record ends.
+    Where lane changes take time its record ends at the overlap; from there on it moves on sideways as fast.
     """
     over: FloatArray = 1.0 - floats(track.column("lane"))
     if "lateral_m" in track.column_names and over[0] == 1.0:
@@ -225,22 +224,24 @@ def share_over(track: pa.Table) -> FloatArray:
         return over
     lateral_m = floats(track.column("lateral_m"))
     if overlap < over.size:
-        at, step = lateral_m[overlap], lateral_m[overlap] - lateral_m[overlap - 1]
-        rest = max(over.size - overlap, math.ceil((LANE_M - at) / step) + 1)
-        lateral_m = np.append(lateral_m[:overlap], at + step * np.arange(rest))
+        overlap_m = lateral_m[overlap]
+        step_m = overlap_m - lateral_m[overlap - 1]
+        rest = max(over.size - overlap, math.ceil((LANE_M - overlap_m) / step_m) + 1)
+        lateral_m = np.append(lateral_m[:overlap], overlap_m + step_m * np.arange(rest))
     return np.minimum(lateral_m / LANE_M, 1.0)
 
 
 def tracks_of(trace: pa.Table) -> dict[str, pa.Table]:
     """The rows of each vehicle of an episode's trace."""
-    return {name: _of(trace, name) for name in dict.fromkeys(trace.column("vehicle").cast(pa.string()).to_pylist())}
+    names = dict.fromkeys(trace.column("vehicle").cast(pa.string()).to_pylist())
+    return {name: _rows_of(trace, name) for name in names}
 
 
-def _of(traces: pa.Table, vehicle: str) -> pa.Table:
+def _rows_of(traces: pa.Table, vehicle: str) -> pa.Table:
     return traces.filter(pc.equal(traces.column("vehicle").cast(pa.string()), vehicle))
 
 
-def _over(crash: int, end: int, v: FloatArray, v_bv: FloatArray) -> int:
+def _last_shown(crash: int, end: int, v: FloatArray, v_bv: FloatArray) -> int:
     """Last step that is shown of another driver after the AV's crash: it too has crashed, or no longer closes in."""
     until = end
     if end < 0:
@@ -256,40 +257,41 @@ def _brakes(v: FloatArray, first: int) -> int | None:
 
 
 def _facts(scene: Scene, event: str, failed: str | None) -> list[tuple[str, str]]:
-    """What happens, as pairs of a name and a phrase: of the ``event`` by its columns, and how the AV ``failed``."""
+    """What happens, as pairs of a name and a phrase; ``event`` is that of the event, ``failed`` how the AV failed."""
     family = family_named(scene["scenario"])
     bv, av, words = scene["tracks"][family.principal], scene["tracks"][-1], family.words
     first, onset, cut = scene["first"], scene["onset"], scene["event"]
     if onset is None:
         ends = failed or (_ending(av, scene) if av["crash"] is not None else "")
         return [(words.shows[0], words.none), *[("AV", ends)] * bool(ends)]
-    rate, hardest = _closing(av, bv, cut - first), tenths(-float(np.diff(av["v"]).min()) / STEP_S)
     ahead, passed = _gap(av, bv, cut - first), _gap(bv, av, cut - first)
+    rate = _closing(av, bv, cut - first)
     where = f"{tenths(ahead)} m ahead" if passed < 0.0 else f"{tenths(passed)} m behind"
     where += f" and {tenths(abs(rate))} m/s {'slower' if rate > 0.0 else 'faster'}"
     shows = event or f"{tenths(_gap(av, bv, onset - first))} m ahead"
-    told = {
+    phrases = {
         " ".join(words.happens): where if bv["name"] == words.happens[0] else f"{bv['name']} is {where}",
         " ".join(words.shows): shows if onset != cut else ", ".join(filter(None, (event, where))),
-        "AV brakes": f"at up to {hardest} m/s²",
+        "AV brakes": f"at up to {tenths(-float(np.diff(av['v']).min()) / STEP_S)} m/s²",
     }
-    moments = [(step, name) for step, name in scene["moments"] if name in told]
+    moments = [(step, name) for step, name in scene["moments"] if name in phrases]
     ends = f"{STEP_S * cut:.1f} to {STEP_S * (cut + 1):.1f} s"  # a lane changes in this step, a row has it at its end
     times = [ends if step == cut and family.crosses >= 0 else _when(step, cut, words.since) for step, _ in moments]
-    facts = [(name, f"{when}: {told[name]}") for when, (_, name) in zip(times, moments, strict=True)]
+    facts = [(name, f"{when}: {phrases[name]}") for when, (_, name) in zip(times, moments, strict=True)]
     facts += [("AV brakes", "never")] if av["brakes"] is None else []
-    for each in (av, *scene["ghosts"]):
-        who, at = [family.stand_ins[each["name"]][0]] if each is not av else [], onset - first
+    place = onset - first
+    for track in (av, *scene["ghosts"]):
+        remarks = [] if track is av else [family.stand_ins[track["name"]][0]]
         if family.follows:  # how it ends may hang on nothing else
-            ahead = min(_gap(each, other, at) for other in scene["tracks"][:-1])
-            who.append(f"{tenths(ahead / each['v'][at])} s behind at the onset")
-        ends = (each is av and failed) or _ending(each, scene)
-        facts.append((each["name"], ": ".join(filter(None, (", ".join(who), ends)))))
+            ahead = min(_gap(track, other, place) for other in scene["tracks"][:-1])
+            remarks.append(f"{tenths(ahead / track['v'][place])} s behind at the onset")
+        ends = (track is av and failed) or _ending(track, scene)
+        facts.append((track["name"], ": ".join(filter(None, (", ".join(remarks), ends)))))
     return facts
 
 
 def _ending(track: Scene, scene: Scene) -> str:
-    """How it ends for one who follows the principal vehicle from its event on, or who crashes before it."""
+    """How it ends for one who follows the principal vehicle after its event, or who crashes before the event."""
     family, others = family_named(scene["scenario"]), scene["tracks"][:-1]
     first, cut, crash = scene["first"], scene["event"], track["crash"]
     early, bv = scene["onset"] is None, others[family.principal]
@@ -306,14 +308,14 @@ def _ending(track: Scene, scene: Scene) -> str:
         if (rate := _closing(track, bv, end)) > 0.0 and _gap(track, bv, end) < rate * UNDECIDED_S:
             return f"no crash until the test ends, {gap} behind {bv['name']} and still {tenths(rate)} m/s faster"
         return f"avoids it, {gap} at the closest" + f" since {family.words.since}" * bool(scene["onset"] < cut)
-    at = crash - first
-    bv = min(others, key=lambda each: abs(_gap(track, each, at))) if early else bv
-    v, v_bv = (tenths(float(each["v"][at])) for each in (track, bv))
+    contact = crash - first
+    bv = min(others, key=lambda each: abs(_gap(track, each, contact))) if early else bv
+    v, v_bv = (tenths(float(each["v"][contact])) for each in (track, bv))
     from_the_side = not early and family.crosses == family.principal and scene["onset"] < cut and crash == cut + 1
     who = f"{bv['name']} moves sideways into it" if from_the_side else f"strikes {bv['name']} from behind"
     when = f"{STEP_S * crash:.1f} s, before anything happens" if early else _when(crash, cut, family.words.since)
     speeds = f"it drives {v} m/s, {bv['name']} {v_bv} m/s"
-    return f"crashes at {when}: {who}; {speeds}: impact {tenths(_closing(track, bv, at))} m/s"
+    return f"crashes at {when}: {who}; {speeds}: impact {tenths(_closing(track, bv, contact))} m/s"
 
 
 def _gap(track: Scene, bv: Scene, place: int) -> float:

@@ -69,7 +69,7 @@ def convergence_plot(run: RunFolder) -> Plot | None:
     points = sorted(estimates.convergence, key=lambda point: point.n)
     if len(points) < 2 or not points[-1].crash_rate:
         return None
-    columns = [(each.n, each.crash_rate, each.ci_low, each.ci_high, each.rhw) for each in points]
+    columns = [(point.n, point.crash_rate, point.ci_low, point.ci_high, point.rhw) for point in points]
     n, rate, low, high, rhw = np.array(columns, np.float64).T
     confidence, level = share(estimates.confidence), plain(estimates.lane_change_level)
     tests = PlotAxis("tests", float(n[0]), float(n[-1]), log=True)
@@ -116,10 +116,10 @@ def _rhw_panel(tests: PlotAxis, n: FloatArray, rhw: FloatArray, target: float | 
     return panel
 
 
-def shells_plot(found: ShownShells) -> Plot:
+def shells_plot(shown: ShownShells) -> Plot:
     """Draw contribution with its limits (left) and half-width (right), from careful to careless."""
-    shells, names = found.shells, (*(shell.shell for shell in found.shells), POOL)
-    pool = float(np.nan_to_num(found.pool_half_width))  # NaN where it is not known: there is no interval then
+    shells, names = shown.shells, (*(shell.shell for shell in shown.shells), POOL)
+    pool = float(np.nan_to_num(shown.pool_half_width))  # NaN where it is not known: there is no interval then
     half_widths = np.array([*(shell.half_width for shell in shells), pool])
     # An untested shell may hold anything up to its probability: it would flatten all others, and runs out instead.
     tested = [shell for shell in shells if shell.n_episodes] or list(shells)
@@ -129,24 +129,24 @@ def shells_plot(found: ShownShells) -> Plot:
     adds = PlotAxis("contribution to the crash rate, per test", 0.0, limit)
     left = PlotPanel("Where the rate comes from", adds, y, height=height)
     right = PlotPanel("Where the uncertainty lies", PlotAxis("half-width, per test", 0.0, widest), y, height=height)
-    at, inside = rows[:-1], np.array([shell.inside for shell in shells])
+    places, inside = rows[:-1], np.array([shell.inside for shell in shells])
     low, rate, high = np.array([(shell.low, shell.contribution, shell.high) for shell in shells]).T
     for kind, colour in ((inside, "blue"), (~inside, "vermillion")):
-        left.add("boxes", colour, 0.0 * at[kind], rate[kind], at[kind] - 0.3, at[kind] + 0.3, opacity=0.85)
-    left.add("boxes", "ink", low, high, at - 0.04, at + 0.04)
+        left.add("boxes", colour, 0.0 * places[kind], rate[kind], places[kind] - 0.3, places[kind] + 0.3, opacity=0.85)
+    left.add("boxes", "ink", low, high, places - 0.04, places + 0.04)
     for row, shell in enumerate(shells):
         if shell.high > limit:
             left.add("text", "muted", 0.1 * limit, row - 0.26, label=f"not tested: up to {number(shell.high)}")
     right.add("boxes", "grey", 0.0 * rows, half_widths, rows - 0.3, rows + 0.3, opacity=0.85)
     for row, width in enumerate(half_widths.tolist()):
-        text = share(found.share_of_uncertainty(width), least=0.001) + " →" * (width > widest)
+        text = share(shown.share_of_uncertainty(width), least=0.001) + " →" * (width > widest)
         right.add("text", "muted", min(width, widest / 1.3), row, label=text)
-    if (boundary := found.within.n_shells - 0.5) < len(shells) - 0.5:
+    if (boundary := shown.within.n_shells - 0.5) < len(shells) - 0.5:
         label = "outside ↓"  # the boundary is the row above
         for panel, end in ((left, limit * max(left.room_before(label), 0.0)), (right, right.x.high)):
             panel.add("line", "muted", [0.0, end], [boundary] * 2, dash=DASHED, width=1.0)
         left.add("text", "muted", limit, boundary, label=label)
-    source, open_question = _source(found), _open_question(found, names, half_widths.tolist())
+    source, open_question = _source(shown), _open_question(shown, names, half_widths.tolist())
     alt = (
         f"Bars per shell from {shells[0].shell} to {shells[-1].shell}: contribution to the crash rate with limits, and "
         f"half-width. {source} {open_question}"
@@ -161,14 +161,12 @@ def shells_plot(found: ShownShells) -> Plot:
     return Plot("shells", [left, right], alt, caption)
 
 
-def sensitivity_plot(found: Sensitivity) -> Plot:
-    """Draw by how much rate and ratio move where numbers of the traffic are not known: one bar each, the longest first.
-
-    Those of which the tests say nothing are left out.
-    """
-    shown = found.shown[:MOST_BARS]
+def sensitivity_plot(sensitivity: Sensitivity) -> Plot:
+    """Draw how far rate and ratio move if a number of the traffic is another one: one bar each, the longest first."""
+    shown = sensitivity.shown[:MOST_BARS]
     names = tuple(bar.what for bar in shown)
-    ends = np.array([[np.nanmin([*of, 1.0]), np.nanmax([*of, 1.0])] for bar in shown for of in (bar.rate, bar.ratio)])
+    moved = [[*factors, 1.0] for bar in shown for factors in (bar.rate, bar.ratio)]
+    ends = np.array([[np.nanmin(factors), np.nanmax(factors)] for factors in moved])
     rate, ratio = ends[0::2].T, ends[1::2].T
     low, high = 0.9 * float(max(ends[:, 0].min(), 1e-3)), 1.1 * float(ends[:, 1].max())
     rows, known = np.arange(len(names)), np.array([bar.known for bar in shown])
@@ -181,31 +179,31 @@ def sensitivity_plot(found: Sensitivity) -> Plot:
             left, at = np.maximum(rate[0][kind], low), rows[kind]
             panel.add("boxes", colour, left, rate[1][kind], at - 0.3, at + 0.3, opacity=0.85, label=f"rate, {name}")
     thin = rows - 0.06, rows + 0.06
-    # What moves one need not move the other.
-    first, most = (int(np.abs(np.log(np.maximum(of, low))).max(axis=0).argmax()) for of in (rate, ratio))
-    panel.add("boxes", "ink", np.maximum(ratio[0], low), ratio[1], *thin, label=f"its ratio to {found.driver}")
+    # What moves the rate most need not move the ratio most.
+    first, most = (int(np.abs(np.log(np.maximum(factors, low))).max(axis=0).argmax()) for factors in (rate, ratio))
+    panel.add("boxes", "ink", np.maximum(ratio[0], low), ratio[1], *thin, label=f"its ratio to {sensitivity.driver}")
     panel.add("line", "muted", [1.0, 1.0], [y.low, y.high], dash=DASHED, width=1.0)
     text = (
         "Fitted and counted numbers move over nine tenths of what their data leave open, assumed ones over the stated "
-        "range. "
-        f"The rate depends most on {names[first]}: × {number(rate[0][first], 2)} to × {number(rate[1][first], 2)}; its "
-        f"ratio to {found.driver} on {names[most]}: × {number(ratio[0][most], 3)} to × {number(ratio[1][most], 3)}."
+        f"range. The rate depends most on {names[first]}: × {number(rate[0][first], 2)} to × "
+        f"{number(rate[1][first], 2)}; its ratio to {sensitivity.driver} on {names[most]}: × "
+        f"{number(ratio[0][most], 3)} to × {number(ratio[1][most], 3)}."
     )
     return Plot("sensitivity", [panel], text, text)
 
 
-def _source(found: ShownShells) -> str:
-    if found.rate == 0.0:
+def _source(shown: ShownShells) -> str:
+    if shown.rate == 0.0:
         return "No shell contributes: no crash was sampled."
-    most = max(found.shells, key=lambda shell: shell.contribution)
-    return f"Most of the rate comes from {most.shell} ({share(most.contribution / found.rate)})."
+    most = max(shown.shells, key=lambda shell: shell.contribution)
+    return f"Most of the rate comes from {most.shell} ({share(most.contribution / shown.rate)})."
 
 
-def _open_question(found: ShownShells, names: tuple[str, ...], half_widths: list[float]) -> str:
-    if math.isnan(found.pool_half_width):
+def _open_question(shown: ShownShells, names: tuple[str, ...], half_widths: list[float]) -> str:
+    if math.isnan(shown.pool_half_width):
         return "The pool’s own error is not known: its paths are too few."
     widest = max(half_widths)
-    name, most = names[half_widths.index(widest)], share(found.share_of_uncertainty(widest))
+    name, most = names[half_widths.index(widest)], share(shown.share_of_uncertainty(widest))
     if name == POOL:
         return f"Most of what is not known is the pool’s own error ({most}): only a pool of more paths would narrow it."
     return f"Most of what is not known lies in {name} ({most}): further tests help most there."
@@ -230,22 +228,22 @@ def where_plot(run: RunFolder, summary: RunSummary | None = None) -> Plot | None
 def _map(axes: tuple[Shown, Shown], rows: Mapping[str, FloatArray], met: BoolArray, events: str) -> PlotPanel:
     """Share of events that crash in cells, of the rows that ``met`` one."""
     weight, crash = rows["weight"][met], rows["outcome"][met] == CRASH
-    of, n = crash if crash.any() else np.ones_like(crash), crash.size
+    among, n = crash if crash.any() else np.ones_like(crash), crash.size
     cells = int(np.clip(0.7 * math.sqrt(n), 12, 40))  # with few events each in one of its own
     values, edges = list[FloatArray](), list[FloatArray]()
     for axis, number_of in zip(axes, (cells, cells // 2), strict=True):
         value = np.maximum(axis.of(rows)[met], 0.0)
         values.append(value)
         if axis.edges.size:
-            last = np.searchsorted(axis.edges, axis.beyond * float(value[of].max())) + 1
+            last = np.searchsorted(axis.edges, axis.beyond * float(value[among].max())) + 1
             edges.append(axis.edges[max(int(np.searchsorted(axis.edges, value.min())) - 1, 0) : int(last)])
         else:
-            most = axis.beyond * float(np.quantile(value[of], 1.0 if crash.any() else 0.98)) + 1.0
+            most = axis.beyond * float(np.quantile(value[among], 1.0 if crash.any() else 0.98)) + 1.0
             edges.append(np.linspace(0.0, most, number_of + 1))
     (gap, closing), (x, y) = values, edges
     every, crashed = (np.histogram2d(gap, closing, (x, y), weights=w)[0].T for w in (weight, weight * crash))
     shares = np.divide(crashed, every, out=np.full_like(every, -1.0), where=every > 0.0)
-    across, up = (PlotAxis(each.axis, float(of[0]), float(of[-1])) for each, of in zip(axes, edges, strict=True))
+    across, up = (PlotAxis(axis.axis, float(edge[0]), float(edge[-1])) for axis, edge in zip(axes, edges, strict=True))
     panel = PlotPanel(f"Share of {events} that crash", across, up, height=300.0)
     for low, (high, colour) in zip((-0.5, *SHARES), SHARES.items(), strict=False):
         row, column = np.nonzero((shares > low) & (shares <= high))
@@ -269,17 +267,17 @@ def pairs_plot(who: IntArray, weight: FloatArray, values: FloatArray, family: Fa
     place = place.ravel()  # numpy 2.0 gives it another axis
     adds = np.bincount(place, weight)
     gap, closing = (np.bincount(place, weight * x) / adds for x in values)
-    ends = ((axis, max(1.1 * float(of.max()), axis.cell)) for of, axis in ((gap, first), (closing, second)))
+    ends = ((axis, max(1.1 * float(x.max()), axis.cell)) for x, axis in ((gap, first), (closing, second)))
     across, up = (PlotAxis(axis.axis, 0.0, end) for axis, end in ends)
     panel = PlotPanel(f"{words.events.capitalize()} that crash, by who crashes", across, up, height=300.0)
-    told = []
+    shares = []
     for code, (name, colour) in enumerate(WHO.items()):
-        of, n = kind == code, count(int(np.count_nonzero(who == code)))
-        radius = LARGEST * np.sqrt(adds[of] / adds.max())
-        panel.add("dots", colour, gap[of], closing[of], radius, opacity=0.7, label=f"{name} ({n})")
-        told.append(f"{name} on {n}")
+        own, n = kind == code, count(int(np.count_nonzero(who == code)))
+        radius = LARGEST * np.sqrt(adds[own] / adds.max())
+        panel.add("dots", colour, gap[own], closing[own], radius, opacity=0.7, label=f"{name} ({n})")
+        shares.append(f"{name} on {n}")
     text = (
-        f"{words.events.capitalize()} on which a vehicle crashes: {', '.join(told)}. A disc’s area is what "
+        f"{words.events.capitalize()} on which a vehicle crashes: {', '.join(shares)}. A disc’s area is what "
         f"{words.events} within {first.cell:g} {first.unit} and {second.cell:g} {second.unit} add to the rate, "
         f"{number(float(adds.max()))} per test for the largest."
     )

@@ -44,80 +44,93 @@ def end(value: float | None) -> float:
     return math.inf if value is None else value
 
 
-def rows_of(campaign: Campaign, manifest: Mapping[str, Any], told: Estimates) -> Iterator[Row]:
+def rows_of(campaign: Campaign, manifest: Mapping[str, Any], estimates: Estimates) -> Iterator[Row]:
     """All but those of the traffic's replicates."""
-    best, decision, assumed, distance_km = told.best, told.decision, told.assumed, told.distance_per_test_km
+    best, decision, assumed = estimates.best, estimates.decision, estimates.assumed
     if decision is not None:
         yield decided(decision)
-    from_mps, high = campaign.crash.counts_above_mps, best.ci_high if best.n_crashes else best.upper_bound
-    counted, wide = f"crash rate > {plain(from_mps)} m/s" if from_mps else "crash rate", best.is_wide
+    wide = best.is_wide
     from_below = wide and (best.is_open_above or (decision is not None and decision["verdict"] == "rejected"))
     unseen = assumed if assumed is not None and assumed.no_lower_limit else None
-    less, shown, ends = "", best.crash_rate, interval(best.ci_low, best.ci_high, beside=best.crash_rate)
-    seen = f"estimate {number(best.crash_rate)}" if best.n_crashes else "no crash seen"
-    if unseen is not None:
-        less, shown, ends = "< ", unseen.most * high, f"{number(best.crash_rate)} as fitted"
-        ends = ends if best.n_crashes else seen
-    elif from_below:  # the other end says nothing
-        less, shown, ends = "> ", best.ci_low, seen
-    elif not best.n_crashes or wide:
-        less, shown, ends = "< ", high, seen
-    per_km = "" if not distance_km else f"{less}{number(shown * 1e6 / distance_km)} per million km"
-    remark = per_km if unseen is None else f"none seen at {unseen.where}"
     so_far = " so far" if best.untested and best.n_crashes else ""
-    rows = [Row("rate", f"{counted}{so_far}", f"{less}{number(shown)} per test", ends, remark)]
-    beside = [each for each in best.details.get("references", ()) if each["crash_rate"] > 0.0][:1]
+    above_mps = campaign.crash.counts_above_mps
+    what = (f"crash rate > {plain(above_mps)} m/s" if above_mps else "crash rate") + so_far
+    rows = [_rate_row(what, estimates, unseen, from_below=from_below)]
+    references = [each for each in best.details.get("references", ()) if each["crash_rate"] > 0.0][:1]
     how = {"wide": wide, "from_below": from_below}
-    how["softened"] = n_softened(before_event(campaign, manifest, told.diagnostics)) > 0
-    rows += [_beside(each, acts=campaign.av.acts_before_event, **how) for each in beside]
-    # Where little else is known of the rate than a limit, what is known comes first: the ratio.
-    yield from reversed(rows) if unseen or (wide and beside and end(beside[0]["ratio_high"]) < 1.0) else rows
-    if not beside and campaign.has_baseline_runs and "shells" in best.details and not best.cautions:
+    how["softened"] = n_softened(before_event(campaign, manifest, estimates.diagnostics)) > 0
+    rows += [_beside(reference, acts=campaign.av.acts_before_event, **how) for reference in references]
+    # Where little else is known of the rate than a limit, the ratio, of which more is known, comes first.
+    yield from reversed(rows) if unseen or (wide and references and end(references[0]["ratio_high"]) < 1.0) else rows
+    if not references and campaign.has_baseline_runs and "shells" in best.details and not best.cautions:
         yield Row("ratio", "× competent driver", "no ratio", "", "that driver never crashes here")
     if assumed is not None and (others := looking_words(assumed)) and not from_below:
-        most, ends = f"up to {number(assumed.most, 2)} times", f"up to {number(assumed.most * high)}"
-        yield Row("assumed", "in other traffic", most, ends, f"if {others}")
+        highest = number(assumed.most * _high(best))
+        most = f"up to {number(assumed.most, 2)} times"
+        yield Row("assumed", "in other traffic", most, f"up to {highest}", f"if {others}")
     if campaign.has_baseline_runs and best.n_crashes:
         yield from width_row(campaign, best, manifest.get("expected"))
-    if told.severity is not None:
-        yield from _severity(told.severity, so_far)
+    if estimates.severity is not None:
+        yield from _severity(estimates.severity, so_far)
     if "within" in best.details and campaign.testing.shells.statement != ASSUMPTION_FREE:
         yield within(best.details["within"])
 
 
-def looking_words(of: AssumedOfRate) -> str:
+def _high(best: Estimate) -> float:
+    return best.ci_high if best.n_crashes else best.upper_bound
+
+
+def _rate_row(what: str, estimates: Estimates, unseen: AssumedOfRate | None, *, from_below: bool) -> Row:
+    """The rate with its interval, or with one limit alone where the other end says nothing."""
+    best, distance_km = estimates.best, estimates.distance_per_test_km
+    sign, shown, ends = "", best.crash_rate, interval(best.ci_low, best.ci_high, beside=best.crash_rate)
+    sampled = f"estimate {number(best.crash_rate)}" if best.n_crashes else "no crash seen"
+    if unseen is not None:
+        sign, shown = "< ", unseen.most * _high(best)
+        ends = f"{number(best.crash_rate)} as fitted" if best.n_crashes else sampled
+    elif from_below:
+        sign, shown, ends = "> ", best.ci_low, sampled
+    elif not best.n_crashes or best.is_wide:
+        sign, shown, ends = "< ", _high(best), sampled
+    remark = "" if not distance_km else f"{sign}{number(shown * 1e6 / distance_km)} per million km"
+    if unseen is not None:
+        remark = f"none seen at {unseen.where}"
+    return Row("rate", what, f"{sign}{number(shown)} per test", ends, remark)
+
+
+def looking_words(assumed: AssumedOfRate) -> str:
     """In which other traffic a rate moves most; empty where no range is stated of who does not look."""
-    if of.highest is None or of.times is None:
+    if assumed.highest is None or assumed.times is None:
         return ""
-    here = "" if of.share is None else f", not {plain(100.0 * of.share)} %,"
-    return f"{plain(100.0 * of.highest)} %{here} do not look behind"
+    here = "" if assumed.share is None else f", not {plain(100.0 * assumed.share)} %,"
+    return f"{plain(100.0 * assumed.highest)} %{here} do not look behind"
 
 
 def width_row(campaign: Campaign, best: Estimate, expected: Mapping[str, int] | None) -> Iterator[Row]:
     """Which of baseline runs and tests makes the interval as wide as it is, and how many of both may do."""
-    whole, runs = best.rhw, end(best.details.get("rhw_from_pool"))
-    if not (math.isfinite(whole) and math.isfinite(runs)):
+    rhw, rhw_of_runs = best.rhw, end(best.details.get("rhw_from_pool"))
+    if not (math.isfinite(rhw) and math.isfinite(rhw_of_runs)):
         return
-    which = "runs" if 2.0 * runs * runs > whole * whole else "tests"
+    which = "runs" if 2.0 * rhw_of_runs * rhw_of_runs > rhw * rhw else "tests"
     remark = "" if expected is None else f"try stop.episodes={expected['tests']}"
     if expected is not None and expected["runs"] != campaign.pool.shadow_paths:
         remark = f"try pool.shadow_paths={expected['runs']}, {count(expected['tests'])} tests"
-    alone = f"{count(campaign.pool.shadow_paths)} baseline runs ± {share(runs)}"
-    yield Row("width", "precision", f"± {share(whole)}, mostly by {which}", alone, remark)
+    alone = f"{count(campaign.pool.shadow_paths)} baseline runs ± {share(rhw_of_runs)}"
+    yield Row("width", "precision", f"± {share(rhw)}, mostly by {which}", alone, remark)
 
 
-def _severity(found: Severity, so_far: str) -> Iterator[Row]:
-    above = _share_within(found.share_above_5_mps, found.limits_above_5_mps, f" above {plain(HARD_MPS)} m/s")
-    below = _share_within(found.share_below_1_mps, found.limits_below_1_mps, f" below {plain(TOUCH_MPS)} m/s")
-    yield Row("impact", f"impact speed{so_far}", f"median {tenths(found.median_mps)} m/s", above, below)
+def _severity(severity: Severity, so_far: str) -> Iterator[Row]:
+    above = _share_within(severity.share_above_5_mps, severity.limits_above_5_mps, f" above {plain(HARD_MPS)} m/s")
+    below = _share_within(severity.share_below_1_mps, severity.limits_below_1_mps, f" below {plain(TOUCH_MPS)} m/s")
+    yield Row("impact", f"impact speed{so_far}", f"median {tenths(severity.median_mps)} m/s", above, below)
 
 
-def _share_within(value: float, limits: tuple[float, float] | None, of: str) -> str:
+def _share_within(value: float, limits: tuple[float, float] | None, suffix: str) -> str:
     """A share with its interval in whole per cent, where there is one; nothing where that may be nearly any."""
     if limits is None:
-        return share(value) + of
+        return share(value) + suffix
     low, high = limits
-    return "" if high - low > ANY_SHARE else f"{share(value)} ({100.0 * low:.0f}–{100.0 * high:.0f} %){of}"
+    return "" if high - low > ANY_SHARE else f"{share(value)} ({100.0 * low:.0f}–{100.0 * high:.0f} %){suffix}"
 
 
 def limit_words(decision: Mapping[str, Any]) -> str:
@@ -148,92 +161,92 @@ def decided(decision: Mapping[str, Any]) -> Row:
     )
 
 
-def _beside(found: Mapping[str, Any], *, acts: bool, **how: bool) -> Row:
-    who = {"r157-cc": "r157-cc, UN R157’s driver"}.get(found["reference"], found["reference"])
+def _beside(reference: Mapping[str, Any], *, acts: bool, **how: bool) -> Row:
+    driver = {"r157-cc": "r157-cc, UN R157’s driver"}.get(reference["reference"], reference["reference"])
     if acts:  # it takes over from the vehicle's own motion: what making room saves is not in the ratio
-        who = f"{found['reference']}, from the same state"
-    return Row("ratio", "× competent driver", *ratio_texts(found, **how), who)
+        driver = f"{reference['reference']}, from the same state"
+    return Row("ratio", "× competent driver", *ratio_texts(reference, **how), driver)
 
 
-def ratio_texts(found: Mapping[str, Any], *, wide: bool, from_below: bool, softened: bool) -> tuple[str, str]:
+def ratio_texts(reference: Mapping[str, Any], *, wide: bool, from_below: bool, softened: bool) -> tuple[str, str]:
     """A ratio to a reference, and its interval, of which a ``wide`` one says what it says with one end alone.
 
     That a vehicle crashes less is said with a reserve where it has ``softened`` the events (`n_softened`).
     """
     less = "crashes less, see !" if softened else "crashes less"
-    low, high, seen = found["ratio_low"], end(found["ratio_high"]), found["ratio"]
+    low, high, value = reference["ratio_low"], end(reference["ratio_high"]), reference["ratio"]
     most = "no limit" if math.isinf(high) else ratio(high)
-    if not seen:
+    if not value:
         return f"< {most}", "no crash seen"
     if wide and (high < 1.0 or (low <= 1.0 and not from_below and high < math.inf)):  # as the row of the rate
-        apart = less if high < 1.0 else "not told apart"
-        return f"< {most} ({apart})", f"estimate {ratio(seen)}, {ratio(low)} to {most}"
+        side = less if high < 1.0 else "not told apart"
+        return f"< {most} ({side})", f"estimate {ratio(value)}, {ratio(low)} to {most}"
     if from_below and low > 1.0:
-        return f"> {ratio(low)} (crashes more)", f"estimate {ratio(seen)}"
-    apart = "not told apart" if low <= 1.0 <= high else "crashes more" if low > 1.0 else less
-    return f"{ratio(seen)} ({apart})", f"≥ {ratio(low)}" if from_below else f"{ratio(low)} to {most}"
+        return f"> {ratio(low)} (crashes more)", f"estimate {ratio(value)}"
+    side = "not told apart" if low <= 1.0 <= high else "crashes more" if low > 1.0 else less
+    return f"{ratio(value)} ({side})", f"≥ {ratio(low)}" if from_below else f"{ratio(low)} to {most}"
 
 
-def within(found: Mapping[str, Any]) -> Row:
+def within(estimate: Mapping[str, Any]) -> Row:
     """What holds if the vehicle crashes only within the library's boundary, and whether it does."""
-    n, outside = found["n_crashes_outside"], count(found["n_episodes_outside"])
+    n, outside = estimate["n_crashes_outside"], count(estimate["n_episodes_outside"])
     what = f"given the {LIBRARY_STATEMENT}"
-    if found["refuted"]:
+    if estimate["refuted"]:
         return Row("within", what, "REFUTED", "", f"{count(n)} crashes in {outside} tests outside it")
-    beyond = f"no crash in {outside} tests outside it" if found["n_episodes_outside"] else "no tests outside it"
-    if not found["n_crashes"]:
-        return Row("within", what, f"< {number(found['ci_high'])}", "", beyond)
-    rate = found["crash_rate"]
-    return Row("within", what, number(rate), interval(found["ci_low"], found["ci_high"], beside=rate), beyond)
+    beyond = f"no crash in {outside} tests outside it" if estimate["n_episodes_outside"] else "no tests outside it"
+    if not estimate["n_crashes"]:
+        return Row("within", what, f"< {number(estimate['ci_high'])}", "", beyond)
+    rate = estimate["crash_rate"]
+    return Row("within", what, number(rate), interval(estimate["ci_low"], estimate["ci_high"], beside=rate), beyond)
 
 
 # -- what replicates of the traffic leave open --
 
 
-def with_traffic(rows: list[Row], found: TrafficError | None) -> list[Row]:
+def with_traffic(rows: list[Row], traffic: TrafficError | None) -> list[Row]:
     """Rows of an answer with those of its traffic below rate and ratio.
 
     Where no lane change was seen the rate has but an upper limit, and stands behind the ratio.
     """
-    if found is None:
+    if traffic is None:
         return rows
-    if found.unseen is not None and not found.is_open:
-        limit, why = f"< {number(found.rate.both[1])} per test", f"none seen at {found.unseen.where}"
+    if traffic.unseen is not None and not traffic.is_open:
+        limit, why = f"< {number(traffic.rate.both[1])} per test", f"none seen at {traffic.unseen.where}"
         for i, row in enumerate(rows):
             if row.key == "rate":
-                seen = f"as fitted {number(found.rate.value)}" if found.rate.value else row.interval
-                rows[i] = replace(row, value=limit, interval=seen, remark=why)
+                fitted = f"as fitted {number(traffic.rate.value)}" if traffic.rate.value else row.interval
+                rows[i] = replace(row, value=limit, interval=fitted, remark=why)
         rows = sorted(rows, key=lambda row: {"verdict": 0, "ratio": 1}.get(row.key, 2))
     place = 1 + max((i for i, row in enumerate(rows) if row.key in ("verdict", "rate", "ratio")), default=-1)
-    return [*rows[:place], *traffic_rows(found), *rows[place:]]
+    return [*rows[:place], *traffic_rows(traffic), *rows[place:]]
 
 
-def traffic_rows(found: TrafficError) -> Iterator[Row]:
+def traffic_rows(traffic: TrafficError) -> Iterator[Row]:
     """Lines of the short answer: of the rate, and of its ratio to the first of the others."""
-    why = "with sampling error" if found.unseen is None else f"none seen at {found.unseen.where}"
-    both, ends = found.rate.both, MISSING
-    if found.is_open:
-        why = f"{found.n_refused} of {found.n_replicates} replicates unlike what was tested"
+    why = "with sampling error" if traffic.unseen is None else f"none seen at {traffic.unseen.where}"
+    both, ends = traffic.rate.both, MISSING
+    if traffic.is_open:
+        why = f"{traffic.n_refused} of {traffic.n_replicates} replicates unlike what was tested"
     else:
-        ends = interval(*both) if found.rate.times[0] > 0.0 else f"< {number(both[1])}"
-    yield Row("traffic", "error of the fit", _times(found.rate), ends, why)
-    for name, each in list(found.ratios.items())[: 0 if found.is_open else 1]:
-        yield Row("traffic_ratio", "the same, ratio", _times(each), _of_ratio(each), f"the ratio to {name}")
+        ends = interval(*both) if traffic.rate.times[0] > 0.0 else f"< {number(both[1])}"
+    yield Row("traffic", "error of the fit", _times(traffic.rate), ends, why)
+    for name, uncertain in list(traffic.ratios.items())[: 0 if traffic.is_open else 1]:
+        yield Row("traffic_ratio", "the same, ratio", _times(uncertain), _of_ratio(uncertain), f"the ratio to {name}")
 
 
-def _of_ratio(of: Uncertain) -> str:
-    low, high = of.both
+def _of_ratio(uncertain: Uncertain) -> str:
+    low, high = uncertain.both
     if math.isfinite(high):
         return f"{ratio(low)} to {ratio(high)}" if low > 0.0 else f"< {ratio(high)}"
     return f"at least {ratio(low)}" if low > 0.0 else "no limit"
 
 
-def _times(of: Uncertain) -> str:
+def _times(uncertain: Uncertain) -> str:
     """``0.6 to 2.1 times``, or ``up to 27 times``."""
-    low, high = (number(end, 2 if end > 0.0 and abs(math.log(end)) > CLOSE else 3) for end in of.times)
-    if of.times[0] > 0.0:
+    low, high = (number(end, 2 if end > 0.0 and abs(math.log(end)) > CLOSE else 3) for end in uncertain.times)
+    if uncertain.times[0] > 0.0:
         return f"{low} to {high} times"
-    return f"up to {high} times" if math.isfinite(of.times[1]) else "no limit"
+    return f"up to {high} times" if math.isfinite(uncertain.times[1]) else "no limit"
 
 
 def bar_note(bar: Mapping[str, Any]) -> str:

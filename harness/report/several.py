@@ -61,7 +61,7 @@ def _sum_rows(content: Mapping[str, Any], *, readings: bool) -> Iterator[Row]:
     """Crashes per hour, and beside the competent driver."""
     hour, seen, decision = content["per_hour"], content["n_crashes"] > 0, content["decision"]
     what = f"crashes > {plain(above)} m/s" if (above := content.get("counts_above_mps")) else "crashes"
-    # Where few tests have rejected a limit upper ends say nothing.
+    # Where a limit was rejected after few tests the upper end says nothing.
     wide = hour["rhw"] is None or hour["rhw"] > WIDE_RHW
     from_below = wide and decision is not None and decision["verdict"] == "rejected"
     if from_below:
@@ -72,11 +72,11 @@ def _sum_rows(content: Mapping[str, Any], *, readings: bool) -> Iterator[Row]:
         yield Row("rate", what, f"{number(hour['rate'])} per hour", ends, per_km)
     else:
         yield Row("rate", what, f"< {number(hour['upper_bound'])} per hour", "no crash seen")
-    softened = any(n_softened(of["before_event"]) for of in content["families"].values())
+    softened = any(n_softened(family["before_event"]) for family in content["families"].values())
     how = {"seen": seen, "from_below": from_below, "softened": softened}
     yield beside_row("× competent driver", content["beside"], **how)
-    for each in content["readings"] if readings else ():
-        yield beside_row(f"× {each['reference']}", each, **how)
+    for reading in content["readings"] if readings else ():
+        yield beside_row(f"× {reading['reference']}", reading, **how)
 
 
 def beside_row(
@@ -85,74 +85,76 @@ def beside_row(
     """The rate beside a reading of that driver, where crashes were ``seen`` or none; see `ratio_texts`."""
     if beside["ratio"] is None:
         return Row("ratio", name, "no ratio", "", "such a driver never crashes here")
-    found, ends = (beside if seen else {**beside, "ratio": 0.0}), beside["over_assumed"]
+    reading, ends = (beside if seen else {**beside, "ratio": 0.0}), beside["over_assumed"]
     over = "" if ends is None or ends[0] == ends[1] else f"{ratio(ends[0])} to {ratio(ends[1])} over assumed ranges"
     if (limits := beside.get("limits_over_assumed")) is not None:
         most = "no limit" if limits[1] is None else ratio(limits[1])
         over = f"limits {ratio(limits[0])} to {most} over exposures"
-    return Row("ratio", name, *ratio_texts(found, wide=from_below, from_below=from_below, softened=softened), over)
+    return Row("ratio", name, *ratio_texts(reading, wide=from_below, from_below=from_below, softened=softened), over)
 
 
 def family_rows(content: Mapping[str, Any]) -> Iterator[tuple[str, ...]]:
     """A row each: key, name, share of the rate, crashes per hour, ratio, how hard."""
     order = sorted(content["families"].items(), key=lambda item: -(item[1]["rate_per_hour"] or 0.0))
-    for name, of in order:
-        if of["n_crashes"]:
-            part = "" if of["share"] is None else share(of["share"])
-            rate = f"{number(of['rate_per_hour'])}  {between(of['ci_low'], of['ci_high'], of['rate_per_hour'])}"
-            beside = "–" if of["ratio"] is None else f"× {ratio(of['ratio'])}"
-        else:
-            part, rate, beside = "0 %", f"< {number(of['upper_bound'])}", "–"
-        impact = of.get("median_impact_mps")
+    for name, family in order:
+        per_hour, part, beside = family["rate_per_hour"], "0 %", "–"
+        rate = f"< {number(family['upper_bound'])}"
+        if family["n_crashes"]:
+            part = "" if family["share"] is None else share(family["share"])
+            rate = f"{number(per_hour)}  {between(family['ci_low'], family['ci_high'], per_hour)}"
+            beside = "–" if family["ratio"] is None else f"× {ratio(family['ratio'])}"
+        impact = family.get("median_impact_mps")
         hard = "no crash seen" if impact is None else f"median impact {tenths(impact)} m/s"
         yield name, called(name), part, rate, beside, hard
 
 
 def sum_warnings(content: Mapping[str, Any]) -> Iterator[str]:
     """What changes the meaning of the rows, a line each, by scenario."""
-    decision, ends = content.get("decision"), content["beside"]["over_assumed"]
+    decision = content.get("decision")
     if decision and (verdict := decision["verdict"]) != "undecided":
-        over = [each for each in (decision.get("over_assumed"), decision["driver"] and ends) if each]
-        low, high = min((each[0] for each in over), default=math.inf), max((end(each[1]) for each in over), default=0.0)
-        if over and (high >= decision["limit"] if verdict == "accepted" else low <= decision["limit"]):
+        beside = decision["driver"] and content["beside"]["over_assumed"]
+        ranges = [each for each in (decision.get("over_assumed"), beside) if each]
+        low = min((each[0] for each in ranges), default=math.inf)
+        high = max((end(each[1]) for each in ranges), default=0.0)
+        if ranges and (high >= decision["limit"] if verdict == "accepted" else low <= decision["limit"]):
             sign, as_text = ("× ", ratio) if decision["driver"] else ("", number)
             most = "no limit" if math.isinf(high) else as_text(high)
             yield f"assumed numbers may turn this verdict: {sign}{as_text(low)} to {most} over their ranges"
     yield from words.runs_warning(decision)
-    for each in content["readings"]:
-        if _side(each) != _side(content["beside"]):
-            times, interval = ratio_words(each)
-            times = f"{times} ({interval})" if each["ratio"] else interval.replace("0 to", "<") or times
-            yield f"beside {each['reference']}, another reading of UN R157, it is × {times}"
-    for name, of in content["families"].items():
-        told = list(words.warnings_of(name, {**of, "rate": of["rate_per_hour"]}, " per hour"))
-        if (left := of.get("assumed")) and (found := AssumedOfRate(**left)).no_lower_limit:
-            most = found.most * (of["ci_high"] if of["n_crashes"] else of["upper_bound"])
-            told.append(f"{words.unseen_words(found.where)}, here {number(most)} per hour")
-        yield from (f"{called(name)}: {text}" for text in told)
+    for reading in content["readings"]:
+        if _side(reading) != _side(content["beside"]):
+            times, interval = ratio_words(reading)
+            times = f"{times} ({interval})" if reading["ratio"] else interval.replace("0 to", "<") or times
+            yield f"beside {reading['reference']}, another reading of UN R157, it is × {times}"
+    for name, family in content["families"].items():
+        texts = list(words.warnings_of(name, {**family, "rate": family["rate_per_hour"]}, " per hour"))
+        if (stored := family.get("assumed")) and (assumed := AssumedOfRate(**stored)).no_lower_limit:
+            most = assumed.most * (family["ci_high"] if family["n_crashes"] else family["upper_bound"])
+            texts.append(f"{words.unseen_words(assumed.where)}, here {number(most)} per hour")
+        yield from (f"{called(name)}: {text}" for text in texts)
 
 
-def _side(of: Mapping[str, Any]) -> str:
+def _side(beside: Mapping[str, Any]) -> str:
     """On which side of a driver a vehicle is, if on one."""
-    if of["ratio"] is None:
+    if beside["ratio"] is None:
         return ""
-    return "more" if of["ratio_low"] > 1.0 else "less" if (of["ratio_high"] or math.inf) < 1.0 else ""
+    return "more" if beside["ratio_low"] > 1.0 else "less" if (beside["ratio_high"] or math.inf) < 1.0 else ""
 
 
 def exposures(content: Mapping[str, Any]) -> str:
     """What is counted, what assumed: events per hour."""
-    told: dict[str, list[str]] = {}
-    for name, of in content["families"].items():
-        found = of["exposure"]
-        given = found["low"] == found["high"] and found["source"] != "assumed"
-        kind = "counted" if found["counted"] else "given" if given else "assumed"
-        told.setdefault(kind, []).append(f"{called(name)} {plain(float(format(found['per_hour'], '.2g')))}")
-        if EXCLUDED in found["source"]:
-            told[kind][-1] += f" ({EXCLUDED})"
-        left = of["n_crashes"] and of.get("assumed")
-        if left and (others := looking_words(moved := AssumedOfRate(**left))):
-            told[kind][-1] += f" (crashes × {number(moved.most, 2)} if {others})"
-    parts = [f"{kind}: {', '.join(each)}" for kind, each in told.items()]
+    phrases: dict[str, list[str]] = {}
+    for name, family in content["families"].items():
+        exposure = family["exposure"]
+        is_given = exposure["low"] == exposure["high"] and exposure["source"] != "assumed"
+        kind = "counted" if exposure["counted"] else "given" if is_given else "assumed"
+        phrases.setdefault(kind, []).append(f"{called(name)} {plain(float(format(exposure['per_hour'], '.2g')))}")
+        if EXCLUDED in exposure["source"]:
+            phrases[kind][-1] += f" ({EXCLUDED})"
+        assumed = family["n_crashes"] and family.get("assumed")
+        if assumed and (others := looking_words(moved := AssumedOfRate(**assumed))):
+            phrases[kind][-1] += f" (crashes × {number(moved.most, 2)} if {others})"
+    parts = [f"{kind}: {', '.join(scenarios)}" for kind, scenarios in phrases.items()]
     return "events per hour of driving, " + "; ".join([*parts, "other assumed numbers: harness sensitivity"])
 
 
@@ -187,11 +189,11 @@ def pair_words(decision: Mapping[str, Any]) -> str:
     """What is known of who crashes less often (``decision`` in ``compare.json``)."""
     margin, verdict = decision["margin"], decision["verdict"]
     if not margin:
-        told = {"proven": "B crashes less often than A", "refuted": "B crashes more often than A"}
+        verdicts = {"proven": "B crashes less often than A", "refuted": "B crashes more often than A"}
         of_b, of_a = decision.get("n_milder"), decision.get("n_milder_a")
         held = margin is not None and (of_b or decision.get("n_differing"))
         of_safer = {"proven": of_b, "refuted": of_a, "open": held}[verdict]
-        return told.get(verdict, "Not told apart") + ", see !" * bool(of_safer)
+        return verdicts.get(verdict, "Not told apart") + ", see !" * bool(of_safer)
     most = share(margin)
     # Of B / A; told as all else, of A / B.
     high, low = ("" if not end else ratio(1.0 / end) for end in decision.get("ratio") or (None, None))
@@ -204,41 +206,40 @@ def pair_words(decision: Mapping[str, Any]) -> str:
 
 
 def pair_warnings(content: Mapping[str, Any]) -> Iterator[str]:
-    """What changes the meaning of a comparison (``compare.json``): what is so of both once, of A and B."""
-    told: dict[str, list[str]] = {}
+    """What changes the meaning of a comparison (``compare.json``), by side; what holds of both sides is said once."""
+    sides: dict[str, list[str]] = {}
     for name in "AB":
-        of = content[name.lower()]
-        for text in sum_warnings(of) if "families" in content else _warnings_of_side(content, of):
-            told.setdefault(text, []).append(name)
-    yield from (f"{' and '.join(who)}{',' if 'families' in content else ':'} {text}" for text, who in told.items())
+        side = content[name.lower()]
+        for text in sum_warnings(side) if "families" in content else _warnings_of_side(content, side):
+            sides.setdefault(text, []).append(name)
+    yield from (f"{' and '.join(names)}{',' if 'families' in content else ':'} {text}" for text, names in sides.items())
     if where := content.get("unseen"):
         yield words.unseen_words(where)
 
 
-def _warnings_of_side(content: Mapping[str, Any], of: Mapping[str, Any]) -> Iterator[str]:
-    elsewhere = ["failed"] if content["asked"] == LIBRARY_STATEMENT else ["failed", "refuted"]
-    rates = {**of, "rate": of["crash_rate"], "n_failed": of["details"]["n_failed"]}
+def _warnings_of_side(content: Mapping[str, Any], side: Mapping[str, Any]) -> Iterator[str]:
+    told_elsewhere = ["failed"] if content["asked"] == LIBRARY_STATEMENT else ["failed", "refuted"]
+    rates = {**side, "rate": side["crash_rate"], "n_failed": side["details"]["n_failed"]}
     yield from words.warnings_of(content["scenario"], rates, " per test")
-    yield from (
-        note_words(each) for each in of["warnings"] if each["key"] not in elsewhere and each not in of["cautions"]
-    )
+    notes = (each for each in side["warnings"] if each["key"] not in told_elsewhere and each not in side["cautions"])
+    yield from map(note_words, notes)
 
 
 def deciding_words(content: Mapping[str, Any], s_per_pair: float | None = None) -> str | None:
-    """What would decide a comparison (``compare.json``) that was left open, and its cost; None of a decided one."""
+    """What would decide an open comparison (``compare.json``), and at which cost; None where it is decided."""
     decision = content["decision"]
     if decision["verdict"] != "open" or content.get("ended") == "sum":
         return None
     doubted = decision["n_milder"] or decision["n_differing"]
-    if decision["margin"] is not None and doubted:  # which no more pairs would mend
+    if decision["margin"] is not None and doubted:  # more pairs would not mend that
         return None
     if not content["n_only_a"] + content["n_only_b"]:
         return "in no pair of tests did only one crash"
     if (needed := content["to_decide"]) is None:
         return "how many pairs would decide is not known: so far the two are too alike"
-    where, pairs, done = (
-        (" and a new --out", "pairs", 0) if needed["new_folder"] else ("", "more pairs", content["n_pairs"])
-    )
+    where, pairs, done = "", "more pairs", content["n_pairs"]
+    if needed["new_folder"]:
+        where, pairs, done = " and a new --out", "pairs", 0
     n = two_digits_up(needed["pairs"] - done)
     cost = "" if s_per_pair is None else f", {duration(n * s_per_pair)}"
     settings = "".join(f" --set {key}={value}" for key, value in needed["settings"].items())
@@ -249,8 +250,10 @@ def deciding_words(content: Mapping[str, Any], s_per_pair: float | None = None) 
 
 def pair_asked(content: Mapping[str, Any]) -> Mapping[str, Any]:
     """What lies between A and B under the statement that the comparison (``compare.json``) was asked for."""
-    given = content.get("asked") == LIBRARY_STATEMENT and not content["conditional"].get("refuted")  # of one scenario
-    asked: Mapping[str, Any] = content["conditional"] if given else content
+    given_library = content.get("asked") == LIBRARY_STATEMENT  # of one scenario
+    asked: Mapping[str, Any] = content
+    if given_library and not content["conditional"].get("refuted"):
+        asked = content["conditional"]
     return asked
 
 
@@ -259,33 +262,30 @@ def rates_of(side: Mapping[str, Any]) -> dict[str, Any]:
     return {**side, **side.get("per_hour", {"rate": side.get("crash_rate")})}
 
 
-def ratio_words(of: Mapping[str, Any]) -> tuple[str, str]:
+def ratio_words(pair: Mapping[str, Any]) -> tuple[str, str]:
     """A over B, and its interval."""
-    most = "no limit" if of["ratio_high"] is None else ratio(of["ratio_high"])
-    if of["ratio"] is None:  # the one below has not crashed
-        return "–", f"≥ {ratio(of['ratio_low'])}" if of["ratio_low"] else ""
-    return ratio(of["ratio"]), f"{ratio(of['ratio_low'])} to {most}"
+    most = "no limit" if pair["ratio_high"] is None else ratio(pair["ratio_high"])
+    if pair["ratio"] is None:  # the one below has not crashed
+        return "–", f"≥ {ratio(pair['ratio_low'])}" if pair["ratio_low"] else ""
+    return ratio(pair["ratio"]), f"{ratio(pair['ratio_low'])} to {most}"
 
 
-def alone_words(of: Mapping[str, Any]) -> str:
+def alone_words(pair: Mapping[str, Any]) -> str:
     """Pairs of which one crashes and the other does not."""
-    return f"crashes of A alone {count(of['n_only_a'])}, B {count(of['n_only_b'])}"
+    return f"crashes of A alone {count(pair['n_only_a'])}, B {count(pair['n_only_b'])}"
 
 
 def pair_lines(
     content: Mapping[str, Any], campaign: Campaign, report: Path, s_per_pair: float | None = None
 ) -> list[str]:
-    """A comparison (``compare.json``) for a terminal, as short as `lines`; ``s_per_pair`` is what a pair takes.
-
-    Of the ``campaign`` it says which scenario was driven, and which crashes count.
-    """
+    """A comparison (``compare.json``) for a terminal, as short as `lines`; ``s_per_pair`` is the time of a pair (s)."""
     asked, rows = pair_asked(content), []
     for name in "AB":
-        of, label = rates_of(content[name.lower()]), content["campaigns"][name.lower()]["label"]
+        rates, label = rates_of(content[name.lower()]), content["campaigns"][name.lower()]["label"]
         label = label.removeprefix(f"{content['campaigns']['a']['label']}, ").replace("av.parameters.", "")
-        rate, ends = number(of["rate"]), interval(of["ci_low"], of["ci_high"], beside=of["rate"])
-        if not (n := of["n_crashes"]):
-            rate, ends = f"< {number(of['upper_bound'])}", "no crash seen"
+        rate, ends = number(rates["rate"]), interval(rates["ci_low"], rates["ci_high"], beside=rates["rate"])
+        if not (n := rates["n_crashes"]):
+            rate, ends = f"< {number(rates['upper_bound'])}", "no crash seen"
         label = label if len(label) <= words.LABEL else f"{label[: words.LABEL - 2]} …"
         rows.append((f"{name} {label}", rate, ends, f"{count(n)} crash{'es' * (n != 1)}"))
     decision = content["decision"]
@@ -296,14 +296,13 @@ def pair_lines(
     ends = interval(asked["ci_low"], asked["ci_high"], beside=asked["difference"])
     rows.append(("A − B", number(asked["difference"]), ends, alone_words(asked)))
     families = content.get("families", {})
-    ratios = {name: ratio_words(of) for name, of in families.items()}
+    ratios = ((name, pair, *ratio_words(pair)) for name, pair in families.items())
     parts = words.columns(
-        [(called(name), f"A / B {of}", ends, alone_words(families[name])) for name, (of, ends) in ratios.items()]
+        [(called(name), f"A / B {value}", ends, alone_words(pair)) for name, pair, value, ends in ratios]
     )
     remarks = [f"! {text}" for text in pair_warnings(content)]
     if asked is not content:
-        given = f"A / B and A − B assume that both crash only where {asked['boundary']} of the library does"
-        remarks.insert(0, given)
+        remarks.insert(0, f"A / B and A − B assume that both crash only where {asked['boundary']} of the library does")
     scope = words.scope_words(content["confidence"], words.ended_words(content.get("ended"), None))
     counted = f" above {plain(above)} m/s" if (above := campaign.crash.counts_above_mps) else ""
     scenarios, unit = (scenarios_words(families), "hour") if families else (called(campaign.scenario), "test")

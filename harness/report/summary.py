@@ -93,8 +93,8 @@ def typed(path: Path) -> str:
     The bare name stands for a folder that is not below it. An absolute path would say where somebody keeps their files
     to everybody whom the page is mailed to.
     """
-    here, whole = Path.cwd(), Path(os.path.abspath(path))  # noqa: PTH100 - resolve() would follow links
-    return shlex.quote(str(whole.relative_to(here)) if whole.is_relative_to(here) else whole.name)
+    here, absolute = Path.cwd(), Path(os.path.abspath(path))  # noqa: PTH100 - resolve() would follow links
+    return shlex.quote(str(absolute.relative_to(here)) if absolute.is_relative_to(here) else absolute.name)
 
 
 def read_run_folder(path: Path, told: dict[str, Any] | None = None) -> RunFolder:
@@ -186,8 +186,8 @@ def summarise(run: RunFolder) -> RunSummary:
     rows = {name: floats(tests.rows[name]) for name in names}
     outcome = outcome_places(tests.rows["outcome"], where).astype(np.int64)
     left_out: FloatArray = count - np.bincount(outcome, minlength=len(OUTCOMES))  # those weigh 1 each
-    if (counted := run.campaign.crash.counts_above_mps) > 0.0:  # no harder is none here, as in the estimates
-        outcome[(outcome == CRASH) & (rows["impact_speed_mps"] <= counted)] = TIMEOUT
+    if (least_mps := run.campaign.crash.counts_above_mps) > 0.0:  # no harder is none here, as in the estimates
+        outcome[(outcome == CRASH) & (rows["impact_speed_mps"] <= least_mps)] = TIMEOUT
     count = left_out + np.bincount(outcome, minlength=len(OUTCOMES))
     rows["outcome"] = outcome.astype(np.float64)
     if run.shells is None:

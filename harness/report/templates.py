@@ -31,13 +31,13 @@ def templates(package: str = "harness.report") -> Environment:
     place = Path(__file__).parent
     css, script = ((place / name).read_text(encoding="utf-8") for name in ("report.css", "player.js"))
     loader = ChoiceLoader([PackageLoader(each, ".") for each in (package, "harness.report")])
-    found = Environment(loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
+    jinja = Environment(loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
     digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
-    # Our own files, of which the policy of the page lets this one script run, by its hash.
-    found.globals.update(style=Markup(css), script=Markup(script), script_hash=Markup(digest))  # noqa: S704
-    found.filters.update(getmembers(numbers, isfunction), sentence=sentence, note=note_words, method=method_words)
-    found.policies["json.dumps_kwargs"] = {"default": np.ndarray.tolist, "separators": (",", ":")}
-    return found
+    # Our own files; the page's policy lets this one script run, by its hash.
+    jinja.globals.update(style=Markup(css), script=Markup(script), script_hash=Markup(digest))  # noqa: S704
+    jinja.filters.update(getmembers(numbers, isfunction), sentence=sentence, note=note_words, method=method_words)
+    jinja.policies["json.dumps_kwargs"] = {"default": np.ndarray.tolist, "separators": (",", ":")}
+    return jinja
 
 
 def write_page(file: Path, template: str, **content: Any) -> Path:

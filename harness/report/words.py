@@ -66,16 +66,16 @@ class ShortAnswer:
     scope: str
 
 
-def short_answer(campaign: Campaign, manifest: Mapping[str, Any], told: Estimates) -> ShortAnswer:
+def short_answer(campaign: Campaign, manifest: Mapping[str, Any], estimates: Estimates) -> ShortAnswer:
     """The answer of a run's estimates, with what its ``manifest`` says besides."""
     vehicle, parameters = vehicle_words(campaign.av, script=manifest.get("script"))
     return ShortAnswer(
         vehicle=vehicle,
         parameters=tuple(parameters),
-        tests=tests_words(told.n_episodes, campaign.world.engine, family_named(campaign.scenario).words.called),
-        rows=tuple(with_traffic(list(rows_of(campaign, manifest, told)), told.traffic)),
-        warnings=tuple(_warnings(campaign, manifest, told)),
-        scope=_scope(campaign, manifest, told),
+        tests=tests_words(estimates.n_episodes, campaign.world.engine, family_named(campaign.scenario).words.called),
+        rows=tuple(with_traffic(list(rows_of(campaign, manifest, estimates)), estimates.traffic)),
+        warnings=tuple(_warnings(campaign, manifest, estimates)),
+        scope=_scope(campaign, manifest, estimates),
     )
 
 
@@ -85,29 +85,29 @@ def tests_words(n: int, engine: str, scenario: str) -> str:
 
 
 def vehicle_words(av: AutomatedVehicle, *, script: float | None = None) -> tuple[str, list[tuple[str, str]]]:
-    """Who drives the vehicle, and its parameters that are not defaults; a TraCI ``script`` is asked so often (s)."""
-    given = dict[str, Any]()
+    """Who drives the vehicle, and its parameters that are not defaults; ``script`` is the step of a TraCI script, s."""
+    chosen = dict[str, Any]()
     for section, key in ((av.parameters, ""), (av.reaction, "reaction")):
         if isinstance(section, BaseModel):
             usual = type(section)().model_dump()
             changed = {name: value for name, value in section.model_dump().items() if value != usual[name]}
         else:
             changed = dict(section)
-        given |= {key: changed} if key and changed else changed
+        chosen |= {key: changed} if key and changed else changed
     name = av.model or Path(av.controller or av.source).name
     if av.sumo is not None:
-        given |= av.sumo
-        name = f"SUMO’s {given.pop('carFollowModel', 'Krauss')}"
+        chosen |= av.sumo
+        name = f"SUMO’s {chosen.pop('carFollowModel', 'Krauss')}"
     elif script:  # SUMO would know its vehicle's type, whose numbers hold until the script sets others
         accel, decel = plain(av.traci_style.accel_mps2), plain(av.traci_style.decel_mps2)
-        given["type"] = f"accel {accel}, decel {decel}, minGap 0 at first"
-        given |= {} if script == STEP_S else {"step": f"{plain(script)} s"}
+        chosen["type"] = f"accel {accel}, decel {decel}, minGap 0 at first"
+        chosen |= {} if script == STEP_S else {"step": f"{plain(script)} s"}
     elif av.traci is not None:
         name = f"TraCI client {Path(av.traci.command.split()[0]).name}"
     elif av.fmu is not None:
-        given |= av.fmu.start_values
+        chosen |= av.fmu.start_values
         name = Path(av.fmu.file).name
-    return name, [(path, plain(value) if isinstance(value, float) else words(value)) for path, value in leaves(given)]
+    return name, [(path, plain(value) if isinstance(value, float) else words(value)) for path, value in leaves(chosen)]
 
 
 def unseen_words(where: str) -> str:
@@ -115,81 +115,89 @@ def unseen_words(where: str) -> str:
     return f"no lane change was seen at {where} in the data of this traffic: rates have only an upper limit"
 
 
-def doubts_of(campaign: Campaign, manifest: Mapping[str, Any], told: Estimates, times: float = 1.0) -> dict[str, Any]:
-    """What may make the rate of a run doubtful, for `warnings_of`: rates per test, or ``times`` as large."""
-    best, severity = told.best, told.severity
+def doubts_of(
+    campaign: Campaign, manifest: Mapping[str, Any], estimates: Estimates, times: float = 1.0
+) -> dict[str, Any]:
+    """What may make the rate of a run doubtful, for `warnings_of`; rates are per test, multiplied by ``times``."""
+    best, severity = estimates.best, estimates.severity
     return {
-        EARLY: n_left_out(campaign, told.diagnostics.get(EARLY, 0)), "milder": told.milder,
+        EARLY: n_left_out(campaign, estimates.diagnostics.get(EARLY, 0)), "milder": estimates.milder,
         "if_failed_had_crashed": times * best.details["crash_rate_if_failed_had_crashed"],
-        "cut_off": times * told.cut_off, "cut_off_test": told.cut_off_test,
+        "cut_off": times * estimates.cut_off, "cut_off_test": estimates.cut_off_test,
         "cautions": best.cautions, "repeated": manifest.get("repeated"), "failure": manifest.get("failure"),
         "share_below_1_mps": None if severity is None else severity.share_below_1_mps,
-        "missed": _missed(manifest, told, times),
-        "assumed": told.assumed, "before_event": before_event(campaign, manifest, told.diagnostics),
+        "missed": _missed(manifest, estimates, times),
+        "assumed": estimates.assumed, "before_event": before_event(campaign, manifest, estimates.diagnostics),
     }  # fmt: skip
 
 
-def _missed(manifest: Mapping[str, Any], told: Estimates, times: float) -> dict[str, Any] | None:
-    """What a vehicle may do so rarely that no baseline run shows it, if it then crashes on all events."""
-    runs, shells = manifest.get("shadow_runs"), told.best.details.get("shells")
-    if not runs or not shells:
+def _missed(manifest: Mapping[str, Any], estimates: Estimates, times: float) -> dict[str, Any] | None:
+    """How often it may crash in a way so rare that no baseline run showed it; None without baseline runs."""
+    baseline, shells = manifest.get("shadow_runs"), estimates.best.details.get("shells")
+    if not baseline or not shells:
         return None
-    share_unseen = float(clopper_pearson(0, runs["n_runs"], 1.0 - told.confidence)[1])
-    rate = times * share_unseen * math.fsum(each["p"] for each in shells)
-    return {"n_runs": runs["n_runs"], "drives": round(1.0 / share_unseen), "rate": rate}
+    share_unseen = float(clopper_pearson(0, baseline["n_runs"], 1.0 - estimates.confidence)[1])
+    rate = times * share_unseen * math.fsum(shell["p"] for shell in shells)
+    return {"n_runs": baseline["n_runs"], "drives": round(1.0 / share_unseen), "rate": rate}
 
 
-def warnings_of(scenario: str, of: Mapping[str, Any], unit: str, but: str = "") -> Iterator[str]:
-    """What changes the meaning of a rate, a line each: ``of`` are it and its upper limit, tests, and `doubts_of`.
+def warnings_of(scenario: str, result: Mapping[str, Any], unit: str, but: str = "") -> Iterator[str]:
+    """What changes the meaning of a rate, a line each.
 
-    Rates are in a ``unit``. ``but`` is added where tests ended too early to be told safe.
+    ``result`` holds the rate, its upper limit ``ci_high``, the numbers of tests, and `doubts_of`. Rates are in a
+    ``unit``. ``but`` is added where tests ended too early to tell whether they were safe.
     """
-    milder, repeated, touches = of["milder"], of["repeated"] or {}, of.get("share_below_1_mps")
-    if milder is not None and (found := milder["n_crashes"] + milder["n_failed"]):
-        events, ends = family_named(scenario).words.events, " or FAIL" if milder["n_failed"] else ""
-        rate = number(milder["per_hour"] * found / milder["n_tests"], 2)
+    milder = result["milder"]
+    if milder is not None and (n_bad := milder["n_crashes"] + milder["n_failed"]):
+        events = family_named(scenario).words.events
+        ends = " or FAIL" if milder["n_failed"] else ""
+        rate = number(milder["per_hour"] * n_bad / milder["n_tests"], 2)
         yield (
-            f"{count(found)} of {count(milder['n_tests'])} MILDER {events} end in a crash{ends}, too: some {rate} an "
+            f"{count(n_bad)} of {count(milder['n_tests'])} MILDER {events} end in a crash{ends}, too: some {rate} an "
             "hour, which this rate leaves out (docs/families.md says how to count them)"
         )
-    if n := of[EARLY]:
+    if n := result[EARLY]:
         yield (
             f"{count(n)} tests crashed BEFORE the event, as it just followed: it does so in all driving, which "
             "this rate leaves out (testing.method=nde counts it)"
         )
-    yield from map(note_words, of["cautions"])
+    yield from map(note_words, result["cautions"])
+    repeated = result["repeated"] or {}
     if n := len(repeated.get("differing", ())):
         again = count(repeated["n_episodes"])
         yield f"NOT REPRODUCIBLE: {count(n)} of {again} tests run twice differed: see `harness av-check --tests 400`"
-    if (missed := of.get("missed")) and missed["rate"] > of["ci_high"]:
-        n = two_digits_up(missed["n_runs"] * missed["rate"] / of["ci_high"])
-        what = f"crashes there, up to {number(missed['rate'])}{unit}, are in no limit (pool.shadow_paths={n})"
-        yield f"{count(missed['n_runs'])} baseline runs may miss what it does in 1 of {missed['drives']} drives: {what}"
-    if n := of["n_failed"]:
-        failed, had = f"{count(n)} of {count(of['n_episodes'])}", f"{number(of['if_failed_had_crashed'])}{unit}"
-        why = f"; most with: {of['failure']}" if of.get("failure") else ""
-        yield f"{failed} tests FAILED; had they all crashed, as upper limits assume, the rate would be {had}{why}"
-    worst = of["rate"] + of["cut_off"]
-    if worst > max((1.0 + CUT_OFF_SHARE) * of["rate"], of["ci_high"]):
-        ended = f"tests, as test {of['cut_off_test']}, ended while the vehicle was still closing in"
+    if (missed := result.get("missed")) and missed["rate"] > result["ci_high"]:
+        n = two_digits_up(missed["n_runs"] * missed["rate"] / result["ci_high"])
+        n_runs, drives = count(missed["n_runs"]), missed["drives"]
+        unseen = f"crashes there, up to {number(missed['rate'])}{unit}, are in no limit (pool.shadow_paths={n})"
+        yield f"{n_runs} baseline runs may miss what it does in 1 of {drives} drives: {unseen}"
+    if n := result["n_failed"]:
+        n_tests, rate = count(result["n_episodes"]), f"{number(result['if_failed_had_crashed'])}{unit}"
+        why = f"; most with: {result['failure']}" if result.get("failure") else ""
+        failed = f"{count(n)} of {n_tests} tests FAILED"
+        yield f"{failed}; had they all crashed, as upper limits assume, the rate would be {rate}{why}"
+    worst = result["rate"] + result["cut_off"]
+    if worst > max((1.0 + CUT_OFF_SHARE) * result["rate"], result["ci_high"]):
+        ended = f"tests, as test {result['cut_off_test']}, ended while the vehicle was still closing in"
         yield f"{ended}; had all crashed: {number(worst)}{unit}{but}"
+    touches = result.get("share_below_1_mps")
     if touches is not None and touches > 0.5:
         left_out = f"crash.counts_above_mps={plain(TOUCH_MPS)} leaves them out"
         yield f"{share(touches)} of these crashes are touches below {plain(TOUCH_MPS)} m/s: {left_out}"
-    yield from _acts(of.get("before_event"))
+    yield from _acts(result.get("before_event"))
 
 
-def _warnings(campaign: Campaign, manifest: Mapping[str, Any], told: Estimates) -> Iterator[str]:
+def _warnings(campaign: Campaign, manifest: Mapping[str, Any], estimates: Estimates) -> Iterator[str]:
     """What changes the meaning of the rows, a line each."""
-    best, assumed, traffic = told.best, told.assumed, told.traffic
+    best, assumed, traffic = estimates.best, estimates.assumed, estimates.traffic
     rates = {"rate": best.crash_rate, "ci_high": best.ci_high}
-    of = {**rates, "n_episodes": best.n_episodes, "n_failed": best.details["n_failed"]}
-    but = "" if told.decision is None else "; ACCEPTED counts them as crashes"
-    yield from warnings_of(campaign.scenario, of | doubts_of(campaign, manifest, told), " per test", but)
+    result = {**rates, "n_episodes": best.n_episodes, "n_failed": best.details["n_failed"]}
+    but = "" if estimates.decision is None else "; ACCEPTED counts them as crashes"
+    yield from warnings_of(campaign.scenario, result | doubts_of(campaign, manifest, estimates), " per test", but)
     if assumed is not None and assumed.where and assumed.times is None:
         yield unseen_words(assumed.where)
-    yield from runs_warning(told.decision)
-    on_rate = told.decision is not None and not told.decision.get("driver")
+    yield from runs_warning(estimates.decision)
+    on_rate = estimates.decision is not None and not estimates.decision.get("driver")
     if on_rate and assumed is not None and assumed.no_lower_limit:
         yield f"no lane change was seen at {assumed.where}: a limit on the rate rests on that; use --accept r157-cc"
     if (level := campaign.environment.lane_change_level) != 1.0:
@@ -211,8 +219,8 @@ BRAKES_BEFORE = "in {} tests it braked with nobody ahead, which makes the event 
 
 def late_words(*, script: bool) -> str:
     """That a vehicle does nothing before BV is in its lane, and what would show it."""
-    what = "its getLateralLanePosition < 0" if script else "bv_lateral_m > 0"
-    return f"it did nothing before the other car (BV) was in its lane; {what} shows it ~2 s earlier"
+    shows = "its getLateralLanePosition < 0" if script else "bv_lateral_m > 0"
+    return f"it did nothing before the other car (BV) was in its lane; {shows} shows it ~2 s earlier"
 
 
 def cruise_words(did: Sequence[str], *, script: bool) -> str:
@@ -221,56 +229,58 @@ def cruise_words(did: Sequence[str], *, script: bool) -> str:
     return f"{'; '.join(did)}: let it cruise at {speed}, or set av.before_event=controller"
 
 
-def _acts(of: Mapping[str, Any] | None) -> Iterator[str]:
+def _acts(before: Mapping[str, Any] | None) -> Iterator[str]:
     """What the vehicle did before the event, or did not after it (`before_event`), a line each."""
-    if of is not None and of["n_events"] and not of["n_braked"] and not of["built_in"]:
+    if before is None:
+        return
+    if before["n_events"] and not before["n_braked"] and not before["built_in"]:
         yield NEVER_BRAKED
-    if of is not None and (n := of["n_fell_behind"]) > MANY * of["n_events"] and not of["built_in"]:
+    if (n := before["n_fell_behind"]) > MANY * before["n_events"] and not before["built_in"]:
         why = "which makes the event milder: let it keep up"
         yield f"in {count(n)} tests it was over {FAR_BEHIND_S:g} s behind the vehicle ahead when the event began, {why}"
-    if of is None or not of["waits"]:
+    if not before["waits"]:
         return
-    if of["source"] in ("sumo", "traci"):
+    if before["source"] in ("sumo", "traci"):
         yield "SUMO changes lanes in one step: this vehicle cannot see the other car (BV) coming over, as drivers can"
-    elif of["n_events"] and not of["n_took_over_early"]:
-        yield late_words(script=of["script"])
-    did = [BRAKES_BEFORE.format(count(n))] if (n := of["n_braked_before"]) else []
-    if (n := of["n_asked_to_speed_up"]) and not of["built_in"]:  # of our own it is known
+    elif before["n_events"] and not before["n_took_over_early"]:
+        yield late_words(script=before["script"])
+    did = [BRAKES_BEFORE.format(count(n))] if (n := before["n_braked_before"]) else []
+    if (n := before["n_asked_to_speed_up"]) and not before["built_in"]:  # our own models do, which is known
         did.append(f"in {count(n)} tests it asked to speed up before BV was in its lane, and its speed was held")
     if did:
-        yield cruise_words(did, script=of["script"])
+        yield cruise_words(did, script=before["script"])
 
 
-def _scope(campaign: Campaign, manifest: Mapping[str, Any], told: Estimates) -> str:
-    if told.elsewhere is not None:
-        return elsewhere_words(told.elsewhere)
-    best, stopped_by = told.best, told.stopped_by
-    ended, target = ended_words(stopped_by, told.decision), campaign.stop.rhw
+def _scope(campaign: Campaign, manifest: Mapping[str, Any], estimates: Estimates) -> str:
+    if estimates.elsewhere is not None:
+        return elsewhere_words(estimates.elsewhere)
+    best, stopped_by = estimates.best, estimates.stopped_by
+    ended, target = ended_words(stopped_by, estimates.decision), campaign.stop.rhw
     if campaign.accept is None and target is not None and stopped_by not in ("rhw", "below_reference", "accept", "sum"):
         within = campaign.testing.shells.statement != ASSUMPTION_FREE and best.details.get("within")
-        asked = end(within["rhw"]) if within else best.precision
-        width = share(asked) if share(asked) != share(target) else f"{number(100.0 * asked)} %"  # where they differ
-        reached = reached_words(asked, width)
+        rhw = end(within["rhw"]) if within else best.precision
+        width = share(rhw) if share(rhw) != share(target) else f"{number(100.0 * rhw)} %"  # where they differ
+        reached = reached_words(rhw, width)
         if not best.n_crashes or best.cautions:
             reached = ", precision not known" if best.n_crashes else ", no crash seen"
         more = go_on(best.n_episodes) if stopped_by == "episodes" else remedy_words(manifest.get("remedy"))
         more = "" if manifest.get("expected") and best.n_crashes else more  # `width_row` has it
         ended += f"{reached} (asked: ± {share(target)}){more}"
     elif stopped_by == "episodes":
-        decision, n = told.decision, (best.n_episodes, best.n_crashes)
-        ended = "all tests done" if decision is None else ended + go_on(*n, decision)
-    elif stopped_by in ("rhw", "below_reference") and (given := campaign.testing.shells.statement) != ASSUMPTION_FREE:
-        ended += f", given the {given}"
+        decision = estimates.decision
+        ended = "all tests done" if decision is None else ended + go_on(best.n_episodes, best.n_crashes, decision)
+    elif stopped_by in ("rhw", "below_reference") and campaign.testing.shells.statement != ASSUMPTION_FREE:
+        ended += f", given the {campaign.testing.shells.statement}"
     return scope_words(best.confidence, ended)
 
 
 def go_on(n: int, n_crashes: int = 0, decision: Mapping[str, Any] | None = None) -> str:
-    """How a run goes on whose budget of ``n`` tests is used up, and what a ``decision`` takes if none crashes."""
+    """How to go on after a budget of ``n`` tests is used up, and how many would decide if none of them crashes."""
     if decision is None:
         return f"; go on with --resume --set stop.episodes={2 * n}"
     times = end(decision["high"]) / decision["limit"]  # without a crash an upper limit falls with 1/n, or faster
-    known = not n_crashes and 1.0 < times < math.inf
-    enough = f": without a crash at most some {count(two_digits_up(n * times))} tests decide" if known else ""
+    decidable = not n_crashes and 1.0 < times < math.inf
+    enough = f": without a crash at most some {count(two_digits_up(n * times))} tests decide" if decidable else ""
     return f"; go on with --accept as before, --resume --set stop.episodes={2 * n}{enough}"
 
 
@@ -286,24 +296,24 @@ def scope_words(confidence: float, ended: str, counted: str = "") -> str:
 
 
 def remedy_words(changes: Mapping[str, float | None] | None) -> str:
-    """What would have led further, by settings of the pool; one without a number is to be tried."""
+    """Which settings of the pool would have narrowed the interval, to which value; None where that is to be tried."""
     if changes is None:
         return ""
     if not changes:
         return "; no pool is large enough for that: raise stop.rhw"
-    told = []
+    phrases = []
     for key, value in changes.items():
         way = "lower" if key == "pool.relative_error" else "raise"
-        told.append(f"{way} {key}" + ("" if value is None else f" to {value:,.10g}"))
-    return f"; {' and '.join(told)}"
+        phrases.append(f"{way} {key}" + ("" if value is None else f" to {value:,.10g}"))
+    return f"; {' and '.join(phrases)}"
 
 
-def elsewhere_words(found: Elsewhere) -> str:
-    """On what an answer for other traffic rests."""
-    drivers = " and ".join(found.drivers)
-    known = f" (off by {share(found.off, least=0.001)} for {drivers})" if drivers else ""
-    rests = f"assumes that the same share of each shell crashes in both{known}"
-    return f"tested in {found.tested_in}, answered for {found.answered_for}: {rests}"
+def elsewhere_words(elsewhere: Elsewhere) -> str:
+    """What an answer for other traffic rests on."""
+    drivers = " and ".join(elsewhere.drivers)
+    error = f" (off by {share(elsewhere.off, least=0.001)} for {drivers})" if drivers else ""
+    rests = f"assumes that the same share of each shell crashes in both{error}"
+    return f"tested in {elsewhere.tested_in}, answered for {elsewhere.answered_for}: {rests}"
 
 
 # -- for a terminal: some nine lines of 100 columns --
@@ -335,9 +345,9 @@ def few(remarks: list[str], most: int) -> list[str]:
 def headed(answer: ShortAnswer, took_s: float | None) -> str:
     """The first line: who was tested, with as many of its parameters as there is room for, and how often."""
     head = [answer.vehicle, answer.tests, *([] if took_s is None else [duration(took_s)])]
-    if told := ", ".join(map(" ".join, answer.parameters)):
+    if parameters := ", ".join(map(" ".join, answer.parameters)):
         room = WIDTH - len(" · ".join(head)) - 3
-        head[0] += f" ({textwrap.shorten(told, max(room, 8), placeholder=' …')})"
+        head[0] += f" ({textwrap.shorten(parameters, max(room, 8), placeholder=' …')})"
     return " · ".join(head)
 
 
@@ -345,16 +355,16 @@ def run_lines(
     campaign: Campaign, manifest: Mapping[str, Any], content: Estimates | Mapping[str, Any], report: Path
 ) -> list[str]:
     """The answer of a run; the ``report`` is named if it is there, and of the same traffic."""
-    told = STORED_ESTIMATES.validate_python(content)
-    page = report if told.elsewhere is None and report.is_file() else None
-    return lines(short_answer(campaign, manifest, told), manifest.get("wall_time_s"), page)
+    estimates = STORED_ESTIMATES.validate_python(content)
+    page = report if estimates.elsewhere is None and report.is_file() else None
+    return lines(short_answer(campaign, manifest, estimates), manifest.get("wall_time_s"), page)
 
 
 def estimate_lines(content: Mapping[str, Any]) -> list[str]:
     """The estimators of ``estimates.json``, a line each; those that its records do not allow are not named."""
     head = f"{content['campaign']}: {count(content['n_crashes'])} crashes in {count(content['n_episodes'])} tests"
-    found = [(name, each) for name, each in content["estimates"].items() if each["crash_rate"] is not None]
-    rows = [(name, interval(each.get("ci_low"), each.get("ci_high"), each["crash_rate"])) for name, each in found]
+    valid = [(name, each) for name, each in content["estimates"].items() if each["crash_rate"] is not None]
+    rows = [(name, interval(each.get("ci_low"), each.get("ci_high"), each["crash_rate"])) for name, each in valid]
     return [f"{head}; crash rate per test ({share(content['confidence'])})", *columns(rows)]
 
 
@@ -363,10 +373,10 @@ def columns(rows: Sequence[Sequence[str]]) -> Iterator[str]:
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     for row in rows:
         padded = [text.ljust(width) for text, width in zip(row, widths, strict=True)]
-        left, remark = "  ".join(["", *padded[:-1]]).rstrip(), row[-1]
+        begin, remark = "  ".join(["", *padded[:-1]]).rstrip(), row[-1]
         line = "  ".join(["", *padded]).rstrip()
         if len(line) > WIDTH:
-            line = f"{left}  {remark:>{max(WIDTH - 2 - len(left), 0)}}"
+            line = f"{begin}  {remark:>{max(WIDTH - 2 - len(begin), 0)}}"
         for n in reversed(range(len(row) - 1)):
             line = line if len(line) <= WIDTH else "  ".join(["", *padded[:n], *filter(None, row[n:])])
         yield from [line] if len(line) <= WIDTH else wrapped(["  ".join(filter(None, row))])
@@ -376,5 +386,5 @@ def wrapped(texts: Iterable[str]) -> Iterator[str]:
     """Lines of at most `WIDTH` columns, which begin after two spaces and go on after four."""
     fill = textwrap.TextWrapper(WIDTH, initial_indent="  ", subsequent_indent="    ", break_on_hyphens=False)
     for text in texts:
-        whole = text.replace(" %", "\u00a0%").replace("± ", "±\u00a0")  # a number and its sign stay together
-        yield from (line.replace("\u00a0", " ") for line in fill.wrap(whole))
+        joined = text.replace(" %", "\u00a0%").replace("± ", "±\u00a0")  # a number and its sign stay together
+        yield from (line.replace("\u00a0", " ") for line in fill.wrap(joined))
