@@ -42,18 +42,18 @@ class AssumedOfRate:
 
     @property
     def most(self) -> float:
-        """By what the rate may be higher; NaN where nobody knows."""
+        """The factor by which the rate may be higher; NaN where it is not known."""
         return math.nan if self.times is None else self.times[1]
 
     @property
     def no_lower_limit(self) -> bool:
-        """Whether none of the lane changes was seen that a notable part of the rate comes from."""
+        """Whether a notable part of the rate comes from lane changes of which none was seen."""
         return bool(self.where) and self.times is not None and self.times[1] - self.times[0] >= CARRIES
 
 
 @dataclass(frozen=True)
 class Elsewhere:
-    """That tests of one traffic are answered for another, and by how much rates of ``drivers`` come out wrong."""
+    """Tests of one traffic that answer for another; ``off`` is by how much rates of ``drivers`` come out wrong then."""
 
     tested_in: str
     answered_for: str
@@ -96,9 +96,9 @@ class Estimates:
     @property
     def best(self) -> Estimate:
         """The estimate that answers the campaign's question."""
-        found = self.estimates[self.headline]
-        assert isinstance(found, Estimate)
-        return found
+        estimate = self.estimates[self.headline]
+        assert isinstance(estimate, Estimate)
+        return estimate
 
 
 STORED_ESTIMATES = TypeAdapter(Estimates)
@@ -125,36 +125,37 @@ def estimate_blocks(
     level, distance_m = campaign.environment.lane_change_level, manifest.get("distance_per_test_m")
     distance_km = None if distance_m is None else distance_m / 1000.0
     rates = ("rate", best.crash_rate), ("ci_low", best.ci_low), ("ci_high", best.ci_high)
-    told = Estimates(
+    estimates = Estimates(
         campaign=campaign.name, campaign_hash=manifest["campaign_hash"], lane_change_level=level,
         confidence=best.confidence, n_episodes=best.n_episodes, n_crashes=best.n_crashes, headline=done.headline,
         distance_per_test_km=distance_km,
         crash_rate_per_1e6_km=None if distance_km is None else {key: 1e6 / distance_km * rate for key, rate in rates},
-        estimates={name: of.shown if isinstance(of, Estimate) else of for name, of in done.estimates.items()},
+        estimates={name: each.shown if isinstance(each, Estimate) else each for name, each in done.estimates.items()},
         diagnostics=done.diagnostics.result(), convergence=tuple(done.convergence),
         severity=done.severity, cut_off=done.cut_off, cut_off_test=done.cut_off_test,
         assumed=_of_rate(Assumed(**manifest["assumed"]), best) if manifest.get("assumed") else None,
         stopped_by=manifest.get("stopped_by"), unmet=tuple(Note(**each) for each in manifest.get("unmet", ())),
         decision=manifest.get("decision"), milder=manifest.get("milder"),
     )  # fmt: skip
-    return finite_json(told)
+    return finite_json(estimates)
 
 
 def _of_rate(assumed: Assumed, best: Estimate) -> AssumedOfRate:
-    """By what the rate moves; without a crash it is the upper limit that does, which lies in one stratum."""
+    """The factors by which the rate moves over what is assumed; without a crash, those of its upper limit."""
     times, shells = None, best.details.get("shells")
     if assumed.times is not None and shells:
-        p, n, share = np.array([(each["p"], each["n_episodes"], each["crash_share"]) for each in shells]).T
-        of_strata = p * np.vstack([np.ones_like(p), *map(np.array, assumed.times)])
-        rates = of_strata @ share if best.n_crashes else weight_of_a_test(of_strata, n.astype(np.int64)).max(1)
+        p, n, share = np.array([(shell["p"], shell["n_episodes"], shell["crash_share"]) for shell in shells]).T
+        masses = p * np.vstack([np.ones_like(p), *map(np.array, assumed.times)])
+        # Without a crash the upper limit comes from one stratum: that in which a crash would weigh most.
+        rates = masses @ share if best.n_crashes else weight_of_a_test(masses, n.astype(np.int64)).max(1)
         times = float(rates[1] / rates[0]), float(rates[2] / rates[0])
     return AssumedOfRate(assumed.where, assumed.highest, times, assumed.share)
 
 
 def before_event(campaign: Campaign, manifest: Mapping[str, Any], counts: Mapping[str, int]) -> dict[str, Any]:
-    """What a vehicle did, by number of tests (`ACTS`); ``waits`` where it holds its speed while BV comes."""
+    """In how many tests a vehicle did each of `ACTS`; ``waits`` says whether it holds its speed while BV comes."""
     waits = bool(manifest.get("events_show")) and not campaign.av.acts_before_event
-    counted = {name: counts.get(name, 0) for name in ("n_events", *(f"n_{each}" for each in ACTS))}
+    counted = {name: counts.get(name, 0) for name in ("n_events", *(f"n_{act}" for act in ACTS))}
     built_in, script = campaign.av.model is not None, bool(manifest.get("script"))
     return {"source": campaign.av.source, "built_in": built_in, "script": script, "waits": waits, **counted}
 
@@ -180,35 +181,36 @@ def ended_by(campaign: Campaign, rule: Rule, n_episodes: int) -> StoppedBy:
 
 
 def pool_remedy(rule: Rule, campaign: Campaign, stopped_by: StoppedBy) -> dict[str, float | None] | None:
-    """Settings of a pool that ended a run, and to what each is to be changed, None where that is not known.
+    """Which settings of the pool to change after it ended a run, and to what; None where the value is not known.
 
-    It is None where no pool did, and empty where none would lead further. Paths leave 1/√2 of the asked precision, and
-    the shells keep what the tests then take, as `expected_for` has it.
+    None if it was not the pool that ended the run, empty if no pool would lead further. Paths are to leave 1/√2 of the
+    asked precision, and the shells to keep as many events as the tests then take, see `expected_for`.
     """
     if stopped_by not in ("pool", "pool_error"):
         return None
-    pool, target, from_pool, seen = campaign.pool, campaign.stop.rhw, rule.look.rhw_from_pool, rule.seen
+    pool, target, seen = campaign.pool, campaign.stop.rhw, rule.seen
     if campaign.has_baseline_runs or target is None or not isinstance(seen, SeenShells) or math.isinf(rule.look.rhw):
         paths = "pool.shadow_paths" if campaign.has_baseline_runs else "pool.relative_error"
         return {paths if stopped_by == "pool_error" else "pool.events_per_shell": None}
-    finer = max(2.0 * (from_pool / target) ** 2, 1.0)
+    finer = max(2.0 * (rule.look.rhw_from_pool / target) ** 2, 1.0)
     level = Level.two_sided(campaign.stop.confidence)
     times = seen.events_for(seen.more_tests(campaign.testing.shells.statement, level, target, finer) * ROOM)
-    own = target / math.sqrt(2.0) / level.z  # a pool has some paths in any case
-    error = min((pool.relative_error or family_named(campaign.scenario).pool_error) / math.sqrt(finer), own)
-    kept = two_digits_up(min(pool.events_per_shell * times, 1e9))
-    if error < LEAST_POOL_ERROR or kept > MOST_EVENTS:
+    own_error = target / math.sqrt(2.0) / level.z  # a pool has some paths in any case
+    error = min((pool.relative_error or family_named(campaign.scenario).pool_error) / math.sqrt(finer), own_error)
+    events = two_digits_up(min(pool.events_per_shell * times, 1e9))
+    if error < LEAST_POOL_ERROR or events > MOST_EVENTS:
         return {}
     changes: dict[str, float | None] = {"pool.relative_error": math.floor(error * 1e4) / 1e4} if finer > 1.0 else {}
-    return changes | ({"pool.events_per_shell": kept} if times > 1.0 else {})
+    return changes | ({"pool.events_per_shell": events} if times > 1.0 else {})
 
 
 def expected_for(rule: Rule, campaign: Campaign, n_tests: int) -> dict[str, int] | None:
     """How many baseline ``runs`` and ``tests`` in all the asked precision may take; None where nobody can tell."""
-    target, n_runs, pool, seen = campaign.stop.rhw, campaign.pool.shadow_paths, rule.look.rhw_from_pool, rule.seen
-    if not (campaign.has_baseline_runs and isinstance(seen, SeenShells) and target and 0.0 < pool < math.inf):
+    target, from_pool, seen = campaign.stop.rhw, rule.look.rhw_from_pool, rule.seen
+    if not (campaign.has_baseline_runs and isinstance(seen, SeenShells) and target and 0.0 < from_pool < math.inf):
         return None
-    more_runs, level = max(2.0 * (pool / target) ** 2, 1.0), Level.two_sided(campaign.stop.confidence)
+    n_runs, level = campaign.pool.shadow_paths, Level.two_sided(campaign.stop.confidence)
+    more_runs = max(2.0 * (from_pool / target) ** 2, 1.0)
     if math.isinf(more_tests := seen.more_tests(campaign.testing.shells.statement, level, target, more_runs)):
         return None  # a stratum that cannot be tested: nothing will do
     runs, tests = two_digits_up(n_runs * more_runs), two_digits_up(n_tests * more_tests)

@@ -51,20 +51,20 @@ class BesideReference:
 
 def compared(design: ShellDesign, cells: Tally, level: Level) -> tuple[BesideReference, ...]:
     """The vehicle beside each reference that crashes at all; ``cells`` are its tests by the design's cells."""
-    found, own = [], float(design.p @ cells.joined(design.joined).share)
+    rows, rate_of_vehicle = [], float(design.p @ cells.joined(design.joined).share)
     for r, reference in enumerate(design.references):
         if (rate := float(design.reference_rate[r])) == 0.0:
             continue
-        ratio = own / rate if rate > 0.0 else math.nan, *beside(design, cells, r, design.p.size, level)
+        ratio = rate_of_vehicle / rate if rate > 0.0 else math.nan, *beside(design, cells, r, design.p.size, level)
         prevented = ~design.crashes_too(r)
         preventable = preventable_share(design.cell_p, cells, prevented, design.n_independent, level)
         error = design.reference_error(r)
-        found.append(BesideReference(reference.name, reference.delay_s, rate, error, *ratio, *preventable))
-    return tuple(found)
+        rows.append(BesideReference(reference.name, reference.delay_s, rate, error, *ratio, *preventable))
+    return tuple(rows)
 
 
 def beside(design: ShellDesign, cells: Tally, r: int, n_strata: int, level: Level) -> tuple[float, float]:
-    """Limits of the rate of the first strata over that of a reference; any where crashes lie on too few paths."""
+    """Limits of the rate of the first strata over a reference's; 0 and infinity where crashes lie on too few paths."""
     p, strata = design.p[:n_strata], slice(0, n_strata)
 
     def limits(tests: Tally) -> tuple[float, float]:
@@ -143,8 +143,8 @@ def share_of_crashes(
     p, n_paths = design.p, design.n_independent
     others = every._replace(crashes=every.crashes - some.crashes, crash_mass=every.crash_mass - some.crash_mass)
     first, second = (others, some) if of_the_others else (some, others)
-    rates = [float(p @ each.share) for each in (first, second)]
-    of_paths = [pool_variance(p, each, n_paths) for each in (first, second)]
+    rates = [float(p @ tally.share) for tally in (first, second)]
+    of_paths = [pool_variance(p, tally, n_paths) for tally in (first, second)]
 
     def variance(x: float) -> float:
         both = 2.0 * x * (1.0 - x) * rates[0] * rates[1] / n_paths

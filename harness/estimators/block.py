@@ -130,7 +130,7 @@ class Block:
 
     def acts(self) -> dict[str, int]:
         """In how many episodes there was an event, and in how many the AV did each of `ACTS`."""
-        counted = {"n_events": self.happened} | {f"n_{of}": self.columns[of] for of in ACTS if of in self.columns}
+        counted = {"n_events": self.happened} | {f"n_{act}": self.columns[act] for act in ACTS if act in self.columns}
         return {name: int(np.count_nonzero(rows)) for name, rows in counted.items()}
 
     def weights(self) -> FloatArray:
@@ -188,8 +188,8 @@ class Block:
     def take(self, rows: slice) -> Block:
         """Cut out the block of some consecutive rows, a slice with step 1."""
         start, stop, _ = rows.indices(len(self))
-        whole = (start, stop) == (0, len(self))
-        return self if whole else self.chosen(slice(start, stop), self.first_episode + start)
+        is_all = (start, stop) == (0, len(self))
+        return self if is_all else self.chosen(slice(start, stop), self.first_episode + start)
 
     def chosen(self, rows: slice | IntArray, first_episode: int = 0) -> Block:
         """Block of any rows, numbered anew."""
@@ -203,7 +203,8 @@ def joined(blocks: Sequence[Block]) -> Block:
     if len(blocks) == 1:
         return blocks[0]
     columns = {name: np.concatenate([block.columns[name] for block in blocks]) for name in blocks[0].columns}
-    outcome, log_weight = (np.concatenate([vars(each)[name] for each in blocks]) for name in ("outcome", "log_weight"))
+    outcome = np.concatenate([block.outcome for block in blocks])
+    log_weight = np.concatenate([block.log_weight for block in blocks])
     return replace(blocks[0], outcome=outcome, log_weight=log_weight, columns=columns)
 
 
@@ -221,11 +222,12 @@ def block_from_tables(
     if not index.size:
         raise _damaged("episodes", "no rows", "at least one episode per shard")
     if (gaps := np.diff(index) != 1).any():
-        at = int(np.argmax(gaps))
+        row = int(np.argmax(gaps))
         expected = "every episode once, in index order; a failed one is a row too"
-        raise _damaged(f"episodes, row {at + 1}", f"episode {index[at + 1]} after episode {index[at]}", expected)
+        raise _damaged(f"episodes, row {row + 1}", f"episode {index[row + 1]} after episode {index[row]}", expected)
     outcome = outcome_places(episodes.column("outcome"), "episodes")
-    failed, n_control_steps = outcome == FAILED, _integers(episodes, "n_control_steps")
+    failed = outcome == FAILED
+    n_control_steps = _integers(episodes, "n_control_steps")
     close = pc.less(episodes["end_ttc_s"], DANGER_TTC_S)
     early = pc.less_equal(episodes["took_over_step"], episodes["event_step"])
     columns: dict[str, Column] = {
@@ -252,9 +254,9 @@ def block_from_tables(
             columns |= {name: episodes.column(name).to_numpy() for name in BASELINE_COLUMNS}
             step = pc.fill_null(episodes.column("event_step"), -1).to_numpy()
             columns["step"] = np.where(columns["happened"], step, -1 - index).astype(np.int64)
-    cap, above_mps = None if sampling.controlled else 1.0, campaign.crash.counts_above_mps
-    method, names = campaign.testing.method, campaign.importance_names
-    drawn = SamplingPlan(method, alpha, cap, shells, above_mps, campaign.testing.epsilon, names)
+    testing, above_mps = campaign.testing, campaign.crash.counts_above_mps
+    cap = None if sampling.controlled else 1.0
+    drawn = SamplingPlan(testing.method, alpha, cap, shells, above_mps, testing.epsilon, campaign.importance_names)
     block = Block(int(index[0]), outcome, _log_weights(episodes, failed, int(index[0])), columns, drawn)
     return block.harder_than(above_mps) if above_mps > 0.0 else block
 
@@ -300,9 +302,9 @@ def _log_weights(episodes: pa.Table, failed: BoolArray, first: int) -> FloatArra
     log_weight[np.isnan(log_weight) & failed] = 0.0
     wrong = np.isnan(log_weight) | np.isposinf(log_weight)
     if wrong.any():
-        at = int(np.argmax(wrong))
-        found, expected = f"log_weight {log_weight[at]}", "a number: every weight decides the crash rate"
-        raise _damaged(f"episodes, episode {first + at}", found, expected)
+        row = int(np.argmax(wrong))
+        found, expected = f"log_weight {log_weight[row]}", "a number: every weight decides the crash rate"
+        raise _damaged(f"episodes, episode {first + row}", found, expected)
     return log_weight
 
 
@@ -312,15 +314,16 @@ def _first_ratios(moments: pa.Table, index: IntArray, n_control_steps: IntArray)
     if len(row) and (row[0] < 0 or row[-1] >= len(index) or np.any(np.diff(row) < 0)):
         found = f"rows of episodes {row.min() + index[0]} to {row.max() + index[0]}, or out of order"
         raise _damaged("moments", found, f"episodes {index[0]} to {index[-1]}, in order")
-    counts, needed = np.bincount(row, minlength=len(index)), np.minimum(n_control_steps, MAX_CONTROL_STEPS)
+    counts = np.bincount(row, minlength=len(index))
+    needed = np.minimum(n_control_steps, MAX_CONTROL_STEPS)
     if (counts < needed).any():
-        at = int(np.argmax(counts < needed))
-        expected = f"{needed[at]} as the episodes table says"
-        raise _damaged(f"moments, episode {index[at]}", f"{counts[at]} control steps", expected)
+        episode = int(np.argmax(counts < needed))
+        expected = f"{needed[episode]} as the episodes table says"
+        raise _damaged(f"moments, episode {index[episode]}", f"{counts[episode]} control steps", expected)
     rank = np.arange(len(row)) - (np.cumsum(counts) - counts)[row]
     n_surrogates = moments.schema.field("q").type.list_size
     q, q_sampled = _nested(moments, "q", n_surrogates), moments.column("q_sampled").to_numpy()
-    kept = rank < MAX_CONTROL_STEPS
+    first = rank < MAX_CONTROL_STEPS
     ratios = np.ones((len(index), MAX_CONTROL_STEPS, n_surrogates))
-    ratios[row[kept], rank[kept]] = q[kept] / q_sampled[kept, None]
+    ratios[row[first], rank[first]] = q[first] / q_sampled[first, None]
     return ratios

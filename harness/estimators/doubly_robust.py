@@ -79,5 +79,5 @@ def share_of_one(sums: FloatArray) -> FloatArray:
     n, y, squares = sums[0, 0], sums[0, 1], np.diagonal(sums)[2:]
     with_y = sums[1, 2:] - sums[0, 2:] * y / max(n, 1.0)
     beta = np.clip(np.divide(with_y, squares, out=np.zeros_like(squares), where=squares > 0.0), 0.0, 1.0)
-    left = beta * (beta * squares - 2.0 * with_y)
-    return np.where(np.arange(len(left)) == np.argmin(left), beta, 0.0)
+    change = beta * (beta * squares - 2.0 * with_y)
+    return np.where(np.arange(len(change)) == np.argmin(change), beta, 0.0)

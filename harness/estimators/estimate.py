@@ -90,7 +90,7 @@ class Estimate:
     @property
     def untested(self) -> float:
         """Probability of shells without a test: it adds nothing to the rate, and all of it to the upper end."""
-        return math.fsum(each["p"] for each in self.details.get("shells", ()) if not each["n_episodes"])
+        return math.fsum(shell["p"] for shell in self.details.get("shells", ()) if not shell["n_episodes"])
 
     @property
     def is_open_above(self) -> bool:

@@ -224,7 +224,7 @@ def give(
 
 @compiled
 def _gain(strata: WeightedSum, s: int, nu: float) -> float:
-    """By how much one more test of a stratum moves the limit that has a multiplier."""
+    """By how much one more test of a stratum moves the limit whose multiplier is ``nu``."""
     if strata.tests[s] == 0.0:
         return math.inf
     if nu == 0.0:
@@ -244,19 +244,19 @@ def _root(strata: WeightedSum, level: Level, low: float, high: float, by_crashes
     """
     at_low, at_high = _refusal(strata, level, low, by_crashes), _refusal(strata, level, high, by_crashes)
     end = 1e-13 * high
-    kept = 0
+    last = 0
     for _ in range(_MOST_STEPS):
         middle = (low * at_high - high * at_low) / (at_high - at_low)
-        found = _refusal(strata, level, middle, by_crashes)
-        if found > 0.0:
-            high, at_high = middle, found
-            at_low *= 0.5 if kept == -1 else 1.0
-            kept = -1
+        refusal = _refusal(strata, level, middle, by_crashes)
+        if refusal > 0.0:
+            high, at_high = middle, refusal
+            at_low *= 0.5 if last == -1 else 1.0
+            last = -1
         else:
-            low, at_low = middle, found
-            at_high *= 0.5 if kept == 1 else 1.0
-            kept = 1
-        if found == 0.0 or high - low <= end:
+            low, at_low = middle, refusal
+            at_high *= 0.5 if last == 1 else 1.0
+            last = 1
+        if refusal == 0.0 or high - low <= end:
             break
     return low
 
@@ -313,16 +313,16 @@ def _profile(
             continue
         slope = nu / n
         excess = _excess(slope, weights[s, best], weights[s], share[s])
-        left = 1.0
+        rest = 1.0
         for j in range(n_outcomes):
             theta[j] = 0.0
             if share[s, j] > 0.0:
                 apart = excess + slope * (weights[s, best] - weights[s, j])
                 theta[j] = share[s, j] / apart
-                left -= theta[j]
+                rest -= theta[j]
                 cost += n * share[s, j] * math.log(apart)
         if excess == 0.0:
-            theta[best] = max(left, 0.0)
+            theta[best] = max(rest, 0.0)
         for j in range(n_outcomes):
             total += weights[s, j] * theta[j]
             for i in range(j):

@@ -34,7 +34,7 @@ from harness.estimators.severity import Impacts, Severity
 from harness.estimators.shells import SeenShells
 from harness.estimators.weighted import Moments, Nade, Nde
 from harness.problems import did_you_mean, listed
-from harness.vocabulary import CONTACT, ESTIMATORS, METHODS, SAMPLING, EstimatorName
+from harness.vocabulary import CONTACT, ESTIMATORS, METHODS, SAMPLING, EstimatorName, Method
 
 ACCUMULATORS: dict[EstimatorName, Callable[[], Accumulator]] = {
     "nde": Nde,
@@ -69,10 +69,10 @@ Asked: TypeAlias = EstimatorName | OwnEstimator
 class OwnState(Nade):
     """An estimator of one's own, beside the moments of weighted crashes that say whether a mean can be trusted."""
 
-    def __init__(self, of: OwnEstimator) -> None:
+    def __init__(self, estimator: OwnEstimator) -> None:
         super().__init__()
-        self._name = of.name
-        self._own = self._call(deepcopy, self._call(of.make))  # as it will be once a test has failed
+        self._name = estimator.name
+        self._own = self._call(deepcopy, self._call(estimator.make))  # as it will be once a test has failed
 
     def add(self, block: Block) -> None:
         """Add the episodes of one block."""
@@ -81,20 +81,20 @@ class OwnState(Nade):
 
     def result(self, confidence: float) -> Estimate:
         """Its own estimate, or one with a normal interval, our cautions and our upper bound."""
-        found = self._call(self._own.result, confidence)
-        if not isinstance(found, Estimate):
+        estimate = self._call(self._own.result, confidence)
+        if not isinstance(estimate, Estimate):
             rate = std_error = math.nan
             with suppress(TypeError, ValueError):
-                rate, std_error = map(float, found)
+                rate, std_error = map(float, estimate)
             if not (math.isfinite(rate) and 0.0 <= std_error < math.inf):
                 expected = "a rate and its standard error, or an Estimate"
-                raise HarnessError(f"{self._name}, result", repr(found), expected, "Fix what it returns.")
-            found = self.estimate(rate, std_error, None, confidence)
-        return replace(found, warnings=(*found.warnings, note("own")))
+                raise HarnessError(f"{self._name}, result", repr(estimate), expected, "Fix what it returns.")
+            estimate = self.estimate(rate, std_error, None, confidence)
+        return replace(estimate, warnings=(*estimate.warnings, note("own")))
 
-    def _call(self, work: Callable[..., Any], *given: Any) -> Any:
+    def _call(self, work: Callable[..., Any], *arguments: Any) -> Any:
         try:
-            return work(*given)
+            return work(*arguments)
         except (Exception, SystemExit) as error:
             mend = "Fix the class; it has to bear being copied, too."
             raise HarnessError(self._name, cause_of(error), "an estimator that raises nothing", mend) from error
@@ -106,7 +106,8 @@ class Diagnostics:
     _drawn: SamplingPlan  # of the last block
 
     def __init__(self, onset: int | None = None) -> None:
-        self.n, self.counts, self._onset = 0, Counter[str](), onset
+        self.n, self._onset = 0, onset
+        self.counts = Counter[str]()
         self._weight, self._event, self._contact = Moments(), Moments(), Moments()
         self._ratios = defaultdict[int, Moments](Moments)
 
@@ -138,8 +139,8 @@ class Diagnostics:
         }
 
     def _mean(self, sums: Moments) -> dict[str, float]:
-        known = not self._drawn.sampling.strata
-        return {"mean": sums.mean(self.n), "std_error": sums.std_error(self.n)} if known else UNKNOWN_MEAN
+        has_mean = not self._drawn.sampling.strata
+        return {"mean": sums.mean(self.n), "std_error": sums.std_error(self.n)} if has_mean else UNKNOWN_MEAN
 
 
 def asked_for(estimators: Iterable[Any], where: str) -> list[Asked]:
@@ -153,7 +154,7 @@ def asked_for(estimators: Iterable[Any], where: str) -> list[Asked]:
 def _own(of: Any, where: str) -> OwnEstimator:
     if isinstance(of, OwnEstimator):
         return of
-    what, found = "a class with methods, add and result (see docs/estimators.md)", of
+    wanted, made = "a class with methods, add and result (see docs/estimators.md)", of
     name = getattr(of, "__name__", type(of).__name__)
     if isinstance(of, str):
         installed = {each.name: each.value for each in entry_points(group="harness.estimators")}
@@ -161,15 +162,15 @@ def _own(of: Any, where: str) -> OwnEstimator:
             known = [*ESTIMATORS, *installed]
             mend = did_you_mean(of, known) or "Write my.py:MyEstimator for one of your own."
             raise HarnessError(where, f"'{of}'", f"one of {', '.join(map(repr, known))}, or my.py:MyEstimator", mend)
-        name, found = of.rpartition("/")[2], own_code(installed.get(of, of), where, what)
-    if missing := [each for each in ("methods", "add", "result") if not hasattr(found, each)]:
-        raise HarnessError(where, f"{name} without {' and '.join(missing)}", what, "Add what is missing.")
-    if isinstance(found.methods, str) or not {*found.methods} <= {*METHODS} - {"shells"}:
+        name, made = of.rpartition("/")[2], own_code(installed.get(of, of), where, wanted)
+    if missing := [each for each in ("methods", "add", "result") if not hasattr(made, each)]:
+        raise HarnessError(where, f"{name} without {' and '.join(missing)}", wanted, "Add what is missing.")
+    if isinstance(made.methods, str) or not {*made.methods} <= {*METHODS} - {"shells"}:
         weighted = listed(each for each in METHODS if each != "shells")
         expected = f"those of {weighted} whose tests it can use; shells have no weights"
         mend = 'Write methods = ("forced",), say. Weights have mean 1 only where a method can draw every test.'
-        raise HarnessError(where, f"{name} with methods {found.methods!r}", expected, mend)
-    return OwnEstimator(name, found if isinstance(found, type) else partial(deepcopy, found), tuple(found.methods))
+        raise HarnessError(where, f"{name} with methods {made.methods!r}", expected, mend)
+    return OwnEstimator(name, made if isinstance(made, type) else partial(deepcopy, made), tuple(made.methods))
 
 
 def headline_of(campaign: Campaign) -> Asked:
@@ -178,20 +179,25 @@ def headline_of(campaign: Campaign) -> Asked:
     Raises `HarnessError`: there is no such estimator, or it cannot use such tests.
     """
     where, method, headline = "testing.estimator", campaign.testing.method, campaign.sampling.headline
-    (found,) = asked_for([campaign.testing.estimator or headline], where)
-    if method not in found.methods if isinstance(found, OwnEstimator) else found not in SAMPLING[method].estimators:
+    (estimator,) = asked_for([campaign.testing.estimator or headline], where)
+    if not _can_use(estimator, method):
         mend = f"Choose such a method, or delete the key for {headline}."
-        raise CampaignError(where, f"{found}, with testing.method {method}", "an estimator for such tests", mend)
-    return found
+        raise CampaignError(where, f"{estimator}, with testing.method {method}", "an estimator for such tests", mend)
+    return estimator
+
+
+def _can_use(estimator: Asked, method: Method) -> bool:
+    if isinstance(estimator, OwnEstimator):
+        return method in estimator.methods
+    return estimator in SAMPLING[method].estimators
 
 
 def refusal(block: Block, estimator: Asked) -> Note | None:
     """Why records like this block do not allow an estimator; None if they do."""
     method = block.drawn.method
-    if isinstance(estimator, OwnEstimator):
-        allowed, of = method in estimator.methods, ", ".join(estimator.methods)
-        return None if allowed else note("needs_own", methods=of, method=method)
-    if estimator not in SAMPLING[method].estimators:
+    if not _can_use(estimator, method):
+        if isinstance(estimator, OwnEstimator):
+            return note("needs_own", methods=", ".join(estimator.methods), method=method)
         return note(f"needs_{estimator}", method=method)
     return note("needs_moments") if estimator == "scv" and "first_ratios" not in block.columns else None
 
@@ -228,9 +234,9 @@ def even(blocks: Iterable[Block]) -> Iterator[Block]:
     for block in blocks:
         waiting.append(block)
         while sum(map(len, waiting)) >= size:
-            whole = joined(waiting)
-            waiting = [whole.take(slice(size, len(whole)))] if len(whole) > size else []
-            yield whole.take(slice(0, size))
+            together = joined(waiting)
+            waiting = [together.take(slice(size, len(together)))] if len(together) > size else []
+            yield together.take(slice(0, size))
             n += size
             size = min(max(FEWEST_TOGETHER, round(n * (SPACING - 1.0))), MOST_TOGETHER)
     if waiting:
@@ -253,9 +259,9 @@ def one_pass(
     if (first := next(blocks, None)) is None:
         raise ValueError("an estimate needs at least one episode")
     best = best or first.drawn.sampling.headline
-    asked, own = {str(each): each for each in (*names, best)}, str(best)
-    refusals = {name: refusal(first, asked[name]) for name in (own, *asked)}
-    states = {name: accumulator(asked[name]) for name, why in refusals.items() if why is None}
+    estimators, own = {str(each): each for each in (*names, best)}, str(best)
+    refusals = {name: refusal(first, estimators[name]) for name in (own, *estimators)}
+    states = {name: accumulator(estimators[name]) for name, why in refusals.items() if why is None}
     empty = partial(accumulator, best)
     impacts = Impacts(empty, first.drawn.counts_above_mps) if "impact_mps" in first.columns else None
     diagnostics, convergence, n = Diagnostics(onset), list[Point](), 0
@@ -271,22 +277,23 @@ def one_pass(
         if not convergence or n >= convergence[-1].n * SPACING:
             convergence.append(_point(states[own].result(confidence)))
     results = {name: state.result(confidence) for name, state in states.items()}
-    few: dict[str, Note] = {
+    too_few: dict[str, Note] = {
         name: note("needs_tests", n=n, least=least) for name, least in LEAST_TESTS.items() if n < least
     }
-    if own in few:  # a run that was interrupted: others are refused before a test
-        found, expected = f"{own}, with {n:,} tests", f"{LEAST_TESTS[own]:,}: below, its intervals miss too often"
+    if own in too_few:  # a run that was interrupted: others are refused before a test
+        expected = f"{LEAST_TESTS[own]:,}: below, its intervals miss too often"
         mend = "Go on with --resume, or let another answer: --resume --set testing.estimator=nade."
-        raise CampaignError("testing.estimator", found, expected, mend)
-    refusals = {name: few.get(name) if why is None else why for name, why in refusals.items()}
+        raise CampaignError("testing.estimator", f"{own}, with {n:,} tests", expected, mend)
+    refusals = {name: too_few.get(name) if why is None else why for name, why in refusals.items()}
     if convergence[-1].n != n:
         convergence.append(_point(results[own]))
     estimates = {name: results[name] if why is None else Unavailable(why) for name, why in refusals.items()}
-    of_impacts = (
-        (None, 0.0, None) if impacts is None else (impacts.result(confidence), impacts.cut_off(), impacts.cut_off_test)
-    )
-    return PassResult(estimates, own, results[own], diagnostics, convergence, *of_impacts)
+    result = PassResult(estimates, own, results[own], diagnostics, convergence, None, 0.0, None)
+    if impacts is None:
+        return result
+    severity = impacts.result(confidence)
+    return replace(result, severity=severity, cut_off=impacts.cut_off(), cut_off_test=impacts.cut_off_test)
 
 
-def _point(of: Estimate) -> Point:
-    return Point(of.n_episodes, of.crash_rate, of.ci_low, of.ci_high, of.precision, of.n_crashes)
+def _point(best: Estimate) -> Point:
+    return Point(best.n_episodes, best.crash_rate, best.ci_low, best.ci_high, best.precision, best.n_crashes)

@@ -34,7 +34,7 @@ PairVerdict = Literal["proven", "refuted", "open"]
 
 @cache
 def _kinds(worse: float) -> IntArray:
-    """Of the four outcomes, which ends of A and B belong to each, shape (3, 3, 4); ``worse`` see `Pairs`."""
+    """Which ends of A and B belong to each of the four outcomes, shape (3, 3, 4); ``worse`` see `Pairs`."""
     a, b = np.meshgrid([False, True, worse > 0.0], [False, True, worse < 0.0], indexing="ij")
     return np.stack((a & b, a & ~b, ~a & b, ~a & ~b), axis=2).astype(np.int64)
 
@@ -59,11 +59,11 @@ class PairDecision:
     ratio: tuple[float, float] | None = None
 
     def to_json(self) -> dict[str, Any]:
-        """What there is of it."""
+        """All that is known, as plain content; ``margin`` also if there is none."""
         return {name: value for name, value in asdict(self).items() if value is not None or name == "margin"}
 
     def doubted(self, of_a: int, of_b: int, n_differing: int) -> PairDecision:
-        """The same after what was seen of A and B besides the crashes that count."""
+        """The same after ``of_a`` and ``of_b`` milder crashes of A and B were seen, and tests that differed."""
         held = self.margin is not None and self.verdict == "proven" and (of_b or n_differing)
         verdict = "open" if held else self.verdict
         return replace(self, verdict=verdict, n_milder=of_b, n_milder_a=of_a or None, n_differing=n_differing)
@@ -125,7 +125,7 @@ class Pairs:
     """Pairs of tests of some strata, and limits of what they say: of one scenario per test, or of several per hour.
 
     ``tests_per_hour`` are those that an hour of driving stands for, of each scenario; None of one alone, per test.
-    Where something is asked with A, or B, the ``worse`` (1, or -1; 0 for neither), its failed tests count as crashes.
+    ``worse`` says whose failed tests count as crashes: A's (1), B's (-1), or nobody's (0).
     """
 
     each: tuple[PairCounts, ...]
@@ -134,12 +134,12 @@ class Pairs:
     @property
     def p(self) -> FloatArray:
         """What the strata stand for, shape (S,): their probabilities per test; of several scenarios events per hour."""
-        return np.concatenate([times * of.design.p[: len(of.ends)] for times, of in self._parts])
+        return np.concatenate([times * part.design.p[: len(part.ends)] for times, part in self._parts])
 
     @property
     def ends(self) -> Counts:
         """How pairs ended, of all strata, see `PairCounts`."""
-        return np.concatenate([of.ends for of in self.each])
+        return np.concatenate([part.ends for part in self.each])
 
     @property
     def _parts(self) -> zip[tuple[float, PairCounts]]:
@@ -147,23 +147,23 @@ class Pairs:
 
     def within(self, statement: str | None = None) -> Pairs:
         """Those of the strata that a statement is about, by default those within the boundary."""
-        return replace(self, each=tuple(of.within(statement) for of in self.each))
+        return replace(self, each=tuple(part.within(statement) for part in self.each))
 
     def times(self, factor: float) -> Pairs:
         """So many times as many pairs of each stratum, ending as often."""
-        each = (PairCounts(of.design, np.asarray(of.ends * factor, np.float64), of.mass * factor) for of in self.each)
-        return replace(self, each=tuple(each))
+        parts = ((part, np.asarray(part.ends * factor, np.float64)) for part in self.each)
+        return replace(self, each=tuple(PairCounts(part.design, ends, part.mass * factor) for part, ends in parts))
 
     def pool_variance(self, weights: FloatArray, worse: float = 0.0) -> float:
         """Variance of a weighted sum that comes from the pools' finite number of paths.
 
         Pools of several scenarios are independent, and none knows exactly how often a test has an event.
         """
-        found = []
-        for times, of in self._parts:
-            events = 0.0 if self.tests_per_hour is None else of.design.p_event_error * Pairs((of,)).rate(weights)
-            found.append(times**2 * (of.pool_variance(weights, worse) + events**2))
-        return math.fsum(found)
+        variances = []
+        for times, part in self._parts:
+            events = 0.0 if self.tests_per_hour is None else part.design.p_event_error * Pairs((part,)).rate(weights)
+            variances.append(times**2 * (part.pool_variance(weights, worse) + events**2))
+        return math.fsum(variances)
 
     @property
     def reference(self) -> tuple[float, float] | None:
@@ -172,11 +172,12 @@ class Pairs:
         That is the first of the library that crashes; of several scenarios the first of each, if it crashes or not.
         """
         total, errors = 0.0, list[float]()
-        for times, of in self._parts:
-            crash = np.flatnonzero(of.design.reference_rate) if self.tests_per_hour is None else [0]
-            if of.design.references and len(crash):
-                rate, error = float(of.design.reference_rate[crash[0]]), of.design.reference_error(int(crash[0]))
-                events = 0.0 if self.tests_per_hour is None else of.design.p_event_error * rate
+        for times, part in self._parts:
+            crash = np.flatnonzero(part.design.reference_rate) if self.tests_per_hour is None else [0]
+            if part.design.references and len(crash):
+                rate = float(part.design.reference_rate[crash[0]])
+                error = part.design.reference_error(int(crash[0]))
+                events = 0.0 if self.tests_per_hour is None else part.design.p_event_error * rate
                 total += times * rate
                 errors.append(times * math.hypot(error, events))
         return (total, math.hypot(*errors)) if total else None
@@ -206,7 +207,7 @@ class Pairs:
 
     @property
     def larger_rate(self) -> float:
-        """That of the vehicle that has crashed more often; infinite where neither has."""
+        """The rate of the vehicle that has crashed more often; infinite where neither has."""
         return max(self.rate(A_CRASHES), self.rate(B_CRASHES)) or math.inf
 
     def expected(self, rate: float) -> float:
@@ -214,7 +215,7 @@ class Pairs:
         return rate * int(self.tests.sum()) / float(self.p.sum())
 
     def limit(self, weights: FloatArray, level: Level, side: float) -> float:
-        """One limit of a weighted sum that does not fall where A crashes more often or B less."""
+        """One limit of a weighted sum that grows, or stays, where A crashes more often or B less."""
         variance = self.pool_variance(weights, side)
         return contrast_limit(self.p[:, None] * weights, self.outcomes(side), level, side, variance)
 
@@ -298,7 +299,7 @@ class PairedShells:
 
 
 def no_pairs(design: ShellDesign) -> Pairs:
-    """That of no tests."""
+    """The pairs of no tests."""
     n = len(design.strata)
     return Pairs((PairCounts(design, np.zeros((n, 3, 3), np.int64), np.zeros((n, 3, 3, n))),))
 

@@ -73,29 +73,29 @@ class OfFamily(NamedTuple):
         return self.per_hour * float(rates[self.reference]) if rates.size else 0.0
 
     def over_assumed(self) -> list[tuple[float, float]]:
-        """Rates of the vehicle and of the competent driver at the ends of what is assumed, events per hour as well."""
-        design, of, both = self.seen.design, self.exposure, (self.rate, self.reference_rate)
-        rates = [both]
+        """Rates per hour of the vehicle and of the competent driver, at all ends of what is assumed."""
+        design, exposure = self.seen.design, self.exposure
+        rates = [(self.rate, self.reference_rate)]
         if self.assumed is not None and self.assumed.highest is not None and self.assumed.times is not None:
             cells = design.cell_p * design.crashes_too(self.reference) if design.references else np.zeros(0)
             for times in np.array(self.assumed.times) / self.events_moved[:, None]:
-                told = float(self.p * times @ self.tally.share), both[1]
+                theirs = self.reference_rate
                 if cells.any():
-                    told = told[0], both[1] * float(cells @ times[np.array(design.cell_stratum)] / cells.sum())
-                rates.append(told)
-        ends = [1.0] if of.counted else [of.low / of.per_hour, of.high / of.per_hour]
+                    theirs *= float(cells @ times[np.array(design.cell_stratum)] / cells.sum())
+                rates.append((float(self.p * times @ self.tally.share), theirs))
+        ends = [1.0] if exposure.counted else [exposure.low / exposure.per_hour, exposure.high / exposure.per_hour]
         return [(end * mine, end * theirs) for end in ends for mine, theirs in rates]
 
     @property
     def events_moved(self) -> FloatArray:
-        """By what the probability of an event moves at both ends of what is assumed (2,): an hour's events stay."""
+        """Factors on the probability of an event at both ends of what is assumed (2,); an hour's events stay."""
         times = None if self.assumed is None else self.assumed.times
         return np.ones(2) if times is None else np.array(times) @ self.seen.design.p / self.seen.design.p.sum()
 
     def limits(self, level: Level) -> RateLimits:
         """Rate per hour of the family alone."""
-        times, found = self.per_hour, self.seen.limits(level)
-        return RateLimits(*(times * each for each in found))
+        per_hour, per_test = self.per_hour, self.seen.limits(level)
+        return RateLimits(*(per_hour * value for value in per_test))
 
 
 class PerHour:
@@ -107,37 +107,39 @@ class PerHour:
     @property
     def rate(self) -> float:
         """Crashes per hour."""
-        return math.fsum(of.rate for of in self.families)
+        return math.fsum(family.rate for family in self.families)
 
     @property
     def reference_rate(self) -> float:
         """Crashes per hour of the competent driver."""
-        return math.fsum(of.reference_rate for of in self.families)
+        return math.fsum(family.reference_rate for family in self.families)
 
     @property
     def totals(self) -> tuple[int, int, int]:
         """Tests, crashes and failed tests."""
-        n, crashes, failed = (sum(column) for column in zip(*(of.tally.totals for of in self.families), strict=True))
+        n, crashes, failed = map(sum, zip(*(family.tally.totals for family in self.families), strict=True))
         return n, crashes, failed
 
     def limits(self, level: Level, statement: str = ASSUMPTION_FREE) -> RateLimits:
-        """Rate per hour with limits; anything is possible where crashes lie on too few paths of a pool."""
-        parts = [(of, slice(0, of.seen.design.n_within(statement))) for of in self.families]
-        tallies = [of.tally.part(strata) for of, strata in parts]
-        p = np.concatenate([of.p[strata] for of, strata in parts])
-        rate = math.fsum(float(of.p[strata] @ tally.share) for (of, strata), tally in zip(parts, tallies, strict=True))
+        """Rate per hour with limits; these are 0 and infinity where crashes lie on too few paths of a pool."""
+        parts = [(family, slice(0, family.seen.design.n_within(statement))) for family in self.families]
+        tallies = [family.tally.part(strata) for family, strata in parts]
+        events = [family.p[strata] for family, strata in parts]
+        p = np.concatenate(events)
+        rate = math.fsum(float(own @ tally.share) for own, tally in zip(events, tallies, strict=True))
 
         def limit(side: float, *, worst: bool) -> tuple[float, float]:
-            each = [tally.failed_as_crashes() if worst else tally for tally in tallies]
+            counted = [tally.failed_as_crashes() if worst else tally for tally in tallies]
             variance = 0.0
-            for (of, strata), tally in zip(parts, each, strict=True):  # masses are per test, as a design's p is
-                if paths_that_count(of.seen.design.p[strata], tally) < FEWEST_PATHS:
+            for (family, strata), tally in zip(parts, counted, strict=True):
+                design = family.seen.design
+                masses = design.p[strata]  # per test, as those of the tally
+                if paths_that_count(masses, tally) < FEWEST_PATHS:
                     return math.inf, math.inf
-                own = pool_variance(of.seen.design.p[strata], tally, of.seen.design.n_independent)
-                variance += of.per_hour**2 * own + (of.seen.design.p_event_error * of.rate) ** 2
-            crashes, tests = (
-                np.concatenate(column) for column in zip(*((t.crashes, t.tests) for t in each), strict=True)
-            )
+                pool = pool_variance(masses, tally, design.n_independent)
+                variance += family.per_hour**2 * pool + (design.p_event_error * family.rate) ** 2
+            crashes = np.concatenate([tally.crashes for tally in counted])
+            tests = np.concatenate([tally.tests for tally in counted])
             return likelihood_limit(p, crashes, tests, level, side, variance), variance
 
         (low, variance), (high, _) = limit(-1.0, worst=False), limit(1.0, worst=True)
@@ -147,18 +149,20 @@ class PerHour:
         return RateLimits(rate, max(low, 0.0), high, from_pool, from_pool)
 
     def limits_with_counts(
-        self, level: Level, limits: Callable[[PerHour, Level], tuple[float, float]] = lambda of, at: of.limits(at)[1:3]
+        self,
+        level: Level,
+        limits: Callable[[PerHour, Level], tuple[float, float]] = lambda hour, at: hour.limits(at)[1:3],
     ) -> tuple[float, float]:
         """Limits of the rate, or of something else, where counted exposures are as uncertain as their counts.
 
-        Of k events an exposure x times the counted one costs k (x - 1 - ln x) of the threshold, the Poisson law's
-        likelihood ratio: a limit is the outermost over x of that with what is left of it. The threshold is that of few
-        events, however many crashes there are. There is an outermost one of each family that may crash where no test
-        has, so that the search begins at the best of a grid.
+        After k events an exposure of x times the counted one costs k (x - 1 - ln x) of the threshold, the Poisson law's
+        likelihood ratio. A limit is the outermost over all x of the limit at the rest of the threshold, which is that
+        for few events, however many crashes there are. It may have several local extremes, one for each family without
+        a crash, so that the search begins at the best place of a grid.
         """
         from scipy.optimize import minimize  # noqa: PLC0415 - slow to import, and seldom asked for
 
-        counted = [of.exposure.counted[0] if of.exposure.counted else 0.0 for of in self.families]
+        counted = [family.exposure.counted[0] if family.exposure.counted else 0.0 for family in self.families]
         free = np.flatnonzero(counted)
 
         def limit(log_x: FloatArray, side: int) -> float:
@@ -167,11 +171,10 @@ class PerHour:
             lost = float(np.array(counted) @ (x - 1.0 - np.log(x)))
             if lost >= level.threshold:
                 return math.inf
-            left = Level(level.threshold - lost, level.z * math.sqrt(1.0 - lost / level.threshold))
-            exposures = {
-                of.family: of.exposure.per_hour * own for of, own in zip(self.families, x.tolist(), strict=True)
-            }
-            low, high = limits(self.with_exposures(exposures), left)
+            rest = Level(level.threshold - lost, level.z * math.sqrt(1.0 - lost / level.threshold))
+            scaled = zip(self.families, x.tolist(), strict=True)
+            exposures = {family.family: family.exposure.per_hour * factor for family, factor in scaled}
+            low, high = limits(self.with_exposures(exposures), rest)
             return low if side < 0 else -high
 
         if not free.size:
@@ -198,15 +201,15 @@ class PerHour:
     def _ratio_limits(self, level: Level, *, worst: bool) -> tuple[float, float]:
         errors = np.zeros(3)
         outcomes: list[Counts] = []
-        for of in self.families:
-            design, cells = of.seen.design, of.seen.cells
+        for family in self.families:
+            design, cells = family.seen.design, family.seen.cells
             cells = cells.failed_as_crashes() if worst else cells
             outcomes.append(cells.joined(design.joined).outcomes)
-            found = path_errors(design, cells, of.reference if design.references else None)
-            mine, theirs = of.rate, of.reference_rate
-            errors += of.per_hour**2 * np.array(found)
-            errors += of.seen.design.p_event_error**2 * np.array((mine * mine, mine * theirs, theirs * theirs))
-        p, counts = np.concatenate([of.p for of in self.families]), np.concatenate(outcomes)
+            errors_of_paths = path_errors(design, cells, family.reference if design.references else None)
+            mine, theirs = family.rate, family.reference_rate
+            errors += family.per_hour**2 * np.array(errors_of_paths)
+            errors += design.p_event_error**2 * np.array((mine * mine, mine * theirs, theirs * theirs))
+        p, counts = np.concatenate([family.p for family in self.families]), np.concatenate(outcomes)
         return limits_over(self.reference_rate, p, counts.astype(np.float64), errors.tolist(), level)
 
     @property
@@ -216,7 +219,8 @@ class PerHour:
 
     def expected(self, limit: float, _driver: str | None, _statement: str) -> float:
         """Crashes that these tests would have brought at a multiple of the reference rate, see `SeenShells`."""
-        return limit * self.reference_rate * self.totals[0] / math.fsum(float(of.p.sum()) for of in self.families)
+        events = math.fsum(float(family.p.sum()) for family in self.families)
+        return limit * self.reference_rate * self.totals[0] / events
 
     def beside(self, _driver: str, _statement: str, level: Level) -> tuple[float, float]:
         """Limits of `ratio`."""
@@ -227,26 +231,25 @@ class PerHour:
 
         None where that driver never crashes, or in some family no test has: the rate there, and so the range, is open.
         """
-        if not all(of.rate for of in self.families):
+        if not all(family.rate for family in self.families):
             return None
-        ends = product(*(of.over_assumed() for of in self.families))
-        sums = [[math.fsum(each) for each in zip(*rates, strict=True)] for rates in ends]
+        ends = product(*(family.over_assumed() for family in self.families))
+        sums = [[math.fsum(column) for column in zip(*rates, strict=True)] for rates in ends]
         ratios = [mine / theirs for mine, theirs in sums if theirs > 0.0]
         return (min(ratios), max(ratios)) if len(ratios) == len(sums) else None
 
     def limits_over_assumed(self, level: Level, *, ratio: bool) -> tuple[float, float]:
         """The outermost limits of the rate, or of `ratio`, over both ends of each assumed exposure."""
-        exposures = {of.family: of.exposure for of in self.families}
-        ends = ({of.per_hour} if of.counted else {of.low, of.high} for of in exposures.values())
-        others = (self.with_exposures(dict(zip(exposures, each, strict=True))) for each in product(*ends))
-        limits = [of.ratio(level)[1:] if ratio else of.limits(level)[1:3] for of in others]
+        exposures = {family.family: family.exposure for family in self.families}
+        ends = ({family.per_hour} if family.counted else {family.low, family.high} for family in exposures.values())
+        others = (self.with_exposures(dict(zip(exposures, chosen, strict=True))) for chosen in product(*ends))
+        limits = [family.ratio(level)[1:] if ratio else family.limits(level)[1:3] for family in others]
         return min(low for low, _ in limits), max(high for _, high in limits)
 
     def with_exposures(self, exposures: Mapping[str, float]) -> PerHour:
         """The same tests with other exposures (events per hour), by family."""
-        return PerHour(
-            [of._replace(exposure=own_exposure(of.exposure, exposures.get(of.family))) for of in self.families]
-        )
+        own = [own_exposure(family.exposure, exposures.get(family.family)) for family in self.families]
+        return PerHour([family._replace(exposure=e) for family, e in zip(self.families, own, strict=True)])
 
     def to_json(self, confidence: float, speed_mps: float, *, counts: bool = False) -> dict[str, Any]:
         """All of it, as plain content; with ``counts`` those of exposures are in the interval of the sum."""
@@ -257,9 +260,9 @@ class PerHour:
         of_bound = Level.of_bound(confidence, n)
         bound = self.limits_with_counts(of_bound)[1] if counts else self.limits(of_bound).high
         per_km = 1e6 / (3.6 * speed_mps)  # of a million km, per hour
-        names = dict.fromkeys(name for of in self.families for name in of.seen.design.readings) or [""]
+        names = dict.fromkeys(name for family in self.families for name in family.seen.design.readings) or [""]
         beside, *readings = (
-            PerHour([of._replace(reading=name) for of in self.families])._beside(name, level, counts=counts)
+            PerHour([family._replace(reading=name) for family in self.families])._beside(name, level, counts=counts)
             for name in names
         )
         return {
@@ -268,7 +271,7 @@ class PerHour:
                          "rhw": limits.rhw},
             "counts_in_interval": counts, "mean_speed_mps": speed_mps, "per_1e6_km": limits.rate * per_km,
             "beside": beside, "readings": readings,
-            "families": {of.family: found for of, found in zip(self.families, self._families(confidence), strict=True)},
+            "families": dict(self._families(confidence)),
         }  # fmt: skip
 
     def _beside(self, reference: str, level: Level, *, counts: bool) -> dict[str, Any]:
@@ -282,18 +285,18 @@ class PerHour:
             "ratio_high": high, "over_assumed": over, "limits_over_assumed": limits,
         }  # fmt: skip
 
-    def _families(self, confidence: float) -> Iterator[dict[str, Any]]:
+    def _families(self, confidence: float) -> Iterator[tuple[str, dict[str, Any]]]:
         level, total = Level.two_sided(confidence), self.rate
-        for of in self.families:
-            limits, (n, n_crashes, n_failed) = of.limits(level), of.tally.totals
-            ratio, low, high = PerHour([of]).ratio(level)
-            yield {
-                "exposure": {**of.exposure._asdict()}, "p_event": of.seen.design.p_counted,
+        for family in self.families:
+            limits, (n, n_crashes, n_failed) = family.limits(level), family.tally.totals
+            ratio, low, high = PerHour([family]).ratio(level)
+            yield family.family, {
+                "exposure": {**family.exposure._asdict()}, "p_event": family.seen.design.p_counted,
                 "n_episodes": n, "n_crashes": n_crashes, "n_failed": n_failed,
                 "rate_per_hour": limits.rate, "ci_low": limits.low, "ci_high": limits.high,
-                "upper_bound": of.limits(Level.of_bound(confidence, n)).high,
+                "upper_bound": family.limits(Level.of_bound(confidence, n)).high,
                 "share": limits.rate / total if total > 0.0 else math.nan,
-                "reference_rate_per_hour": of.reference_rate, "ratio": ratio, "ratio_low": low, "ratio_high": high,
+                "reference_rate_per_hour": family.reference_rate, "ratio": ratio, "ratio_low": low, "ratio_high": high,
             }  # fmt: skip
 
 

@@ -139,8 +139,8 @@ class Scv(Nade):
         ]
         saturated = []
         if gain["saturated"]:  # a gain is claimed there whatever the results are
-            of = {"n": len(gain["saturated"]), "of": len(strata), "levels": gain["saturated"]}
-            saturated = [note("saturated", **of, claimed=gain["claimed"], corrected=gain["degrees_of_freedom"])]
+            numbers = {"n": len(gain["saturated"]), "of": len(strata), "levels": gain["saturated"]}
+            saturated = [note("saturated", **numbers, claimed=gain["claimed"], corrected=gain["degrees_of_freedom"])]
         return self.estimate(
             rate, math.sqrt(var_z / n), None, confidence, cautions=[note("published_scv")],
             warnings=saturated, details={**details, "strata": strata},
@@ -248,11 +248,11 @@ class Stratum:
         if centred.size:
             left, singular, right = np.linalg.svd(centred, full_matrices=False)
             largest = max(singular[0], np.linalg.norm(factor[0, :-1]))
-            kept = singular > max(self._n, last - 1) * np.finfo(np.float64).eps * largest
-            rank = int(np.count_nonzero(kept))
-            residual_squares += float(np.sum((left[:, ~kept].T @ target) ** 2))
-            root, explained = right[kept].T / singular[kept], left[:, kept].T @ target
-            most = [self._n // each for each in tests_each]
+            used = singular > max(self._n, last - 1) * np.finfo(np.float64).eps * largest
+            rank = int(np.count_nonzero(used))
+            residual_squares += float(np.sum((left[:, ~used].T @ target) ** 2))
+            root, explained = right[used].T / singular[used], left[:, used].T @ target
+            most = [self._n // n for n in tests_each]
             beta = np.array([root[:, :k] @ explained[:k] for k in most])
         return StratumFit(self._n, last - 1, rank, intercept, residual_squares, total_squares, means, beta)
 

@@ -70,7 +70,8 @@ class Impacts:
 
     def add(self, block: Block) -> None:
         """Add the episodes of one block."""
-        crash, self._n = block.crash, self._n + len(block)
+        self._n += len(block)
+        crash = block.crash
         weight = np.asarray(block.stratum if block.drawn.shells is not None else np.exp(block.log_weight), np.float64)
         self._crashes.append((block.impact_mps[crash], weight[crash]))
         cut_off = block.columns.get("cut_off", np.zeros(len(block), np.bool_))
@@ -88,8 +89,8 @@ class Impacts:
         every = self._above[self._first]
         limits: list[tuple[float, float] | None] = [None, None]
         if isinstance(every, SeenShells):
-            level, each = Level.two_sided(confidence), every.weight_of_a_crash()
-            weight = each[weight.astype(np.int64)]
+            level, per_crash = Level.two_sided(confidence), every.weight_of_a_crash()
+            weight = per_crash[weight.astype(np.int64)]
             for k, (speed, softer) in enumerate(((TOUCH_MPS, True), (HARD_MPS, False))):
                 if isinstance(harder := self._above.get(speed), SeenShells):
                     limits[k] = share_of_crashes(every.design, every.tally, harder.tally, level, of_the_others=softer)
@@ -110,8 +111,8 @@ class Impacts:
 
 def _exceedance(speed: float, state: Accumulator, confidence: float) -> Exceedance:
     if not isinstance(state, SeenShells):
-        of = state.result(confidence)
-        return Exceedance(speed, of.crash_rate, of.ci_low, of.ci_high, of.upper_bound, of.n_crashes)
+        mean = state.result(confidence)
+        return Exceedance(speed, mean.crash_rate, mean.ci_low, mean.ci_high, mean.upper_bound, mean.n_crashes)
     n, n_crashes, _ = state.tally.totals
     limits = state.limits(Level.two_sided(confidence))
     bound = state.limits(Level.of_bound(confidence, n)).high
@@ -122,5 +123,5 @@ def weighted_quantiles(values: FloatArray, weights: FloatArray, quantiles: tuple
     """Values up to which these shares of the weight lie; NaN without weight."""
     if not weights.any():
         return [math.nan] * len(quantiles)
-    found: list[float] = np.quantile(values, quantiles, method="inverted_cdf", weights=weights).tolist()
-    return found
+    places: list[float] = np.quantile(values, quantiles, method="inverted_cdf", weights=weights).tolist()
+    return places

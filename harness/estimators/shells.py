@@ -118,7 +118,7 @@ class SeenShells:
     """Tests of a shells campaign, counted within the ``cells`` of strata; ``tally`` has the counts by stratum."""
 
     design: ShellDesign
-    """If not given, that of the first tests."""
+    """That of the first tests, if none is given."""
 
     def __init__(self, design: ShellDesign | None = None) -> None:
         self.tally = self.cells = empty_tally(0)
@@ -129,7 +129,7 @@ class SeenShells:
 
     @classmethod
     def of(cls, design: ShellDesign, cells: Tally) -> SeenShells:
-        """From counts by cell of the design."""
+        """Tests known by their counts in the design's cells."""
         shells = cls()
         shells.count(design, cells)
         return shells
@@ -145,8 +145,8 @@ class SeenShells:
     def count(self, design: ShellDesign, cells: Tally, on_runs: CrashedTests | None = None) -> None:
         """Count tests by cell of the design."""
         self.design = design
-        known = self.cells if self.cells.tests.size else empty_tally(cells.tests.size)
-        self.cells = known.plus(cells)
+        counted = self.cells if self.cells.tests.size else empty_tally(cells.tests.size)
+        self.cells = counted.plus(cells)
         self._on_runs += [] if on_runs is None else [on_runs]
         self._join()
 
@@ -177,16 +177,17 @@ class SeenShells:
             place = cell[rows] + design.cell_p.size * block.failed[rows]
             self._on_runs.append(CrashedTests(block.shadow[rows], block.step[rows], block.event_mass[rows], place))
         for s in np.unique(stratum[crash]).tolist():
-            named = self._crashed.setdefault(s, [])
+            first_few = self._crashed.setdefault(s, [])
             episodes = block.first_episode + np.flatnonzero(crash & (stratum == s))
-            named += episodes[: MOST_NAMED - len(named)].tolist()
+            first_few += episodes[: MOST_NAMED - len(first_few)].tolist()
         self._join()
 
     def result(self, confidence: float) -> Estimate:
         """Assumption-free estimate; that within the boundary is among its details."""
         tally, design, level = self.tally, self.design, Level.two_sided(confidence)
         n, n_crashes, n_failed = tally.totals
-        free, y, cautions = self._limits(design.p.size, level), self.weight_of_a_crash(), self._cautions()
+        free, cautions = self._limits(design.p.size, level), self._cautions()
+        y = self.weight_of_a_crash()
         squares = float((tally.crashes * y * y).sum())
         details = ShellDetails(
             n_failed, tally.failed_as_crashes().rate(design.p), design.pool, free.from_pool_relative()[0],
@@ -205,10 +206,10 @@ class SeenShells:
         )  # fmt: skip
 
     def std_error(self, n_strata: int | None = None) -> float:
-        """Of the rate of the first strata, all by default, with the pool's own error."""
+        """Standard error of the rate of the first strata (all by default), with the pool's own error."""
         tally, p = self.tally.part(slice(0, n_strata)), self.design.p[:n_strata]
-        of_tests = p * weight_of_a_test(p, tally.tests) * tally.share * (1.0 - tally.share)
-        return math.sqrt(float(of_tests.sum()) + pool_variance(p, tally, self.design.n_independent))
+        variances = p * weight_of_a_test(p, tally.tests) * tally.share * (1.0 - tally.share)
+        return math.sqrt(float(variances.sum()) + pool_variance(p, tally, self.design.n_independent))
 
     @property
     def totals(self) -> tuple[int, int, int]:
@@ -219,7 +220,7 @@ class SeenShells:
     def first_reference(self) -> tuple[str, float] | None:
         """The first reference driver of the library that crashes at all, and its crash rate; None without one."""
         rates = zip(self.design.references, self.design.reference_rate.tolist(), strict=True)
-        return next(((each.name, rate) for each, rate in rates if rate > 0.0), None)
+        return next(((reference.name, rate) for reference, rate in rates if rate > 0.0), None)
 
     def weight_of_a_crash(self) -> FloatArray:
         """What a crash in each stratum adds to the rate, p_s/n_s, shape (S,)."""
@@ -230,7 +231,7 @@ class SeenShells:
         return self._limits(self.design.n_within(statement), level)
 
     def expected(self, limit: float, driver: str | None, statement: str) -> float:
-        """Crashes that these tests of a statement would have brought at a limit, spread evenly over its strata.
+        """Crashes that the tests of a statement's strata would have brought at a limit, spread evenly over them.
 
         The limit is a crash rate, or a multiple of a reference ``driver``'s.
         """
@@ -240,21 +241,22 @@ class SeenShells:
         return limit * int(self.tally.tests[strata].sum()) / float(design.p[strata].sum())
 
     def beside(self, driver: str, statement: str, level: Level) -> tuple[float, float]:
-        """Limits of a statement's rate over that of a reference driver; any where crashes lie on too few paths."""
+        """Limits of a statement's rate over a reference driver's; 0 and infinity where crashes lie on too few paths."""
         design, r = self.design, self._reference(driver)
         if design.reference_rate[r] <= 0.0:
             return 0.0, math.inf
         return beside(design, self.cells, r, design.n_within(statement), level)
 
     def _reference(self, driver: str) -> int:
-        return [each.name for each in self.design.references].index(driver)
+        return [reference.name for reference in self.design.references].index(driver)
 
     def more_tests(self, statement: str, level: Level, rhw: float, more_runs: float) -> float:
-        """How many times as many tests of each stratum, crashing as often, would leave a relative half-width.
+        """Factor on the tests of each stratum, crashing as often, that would leave a relative half-width.
 
-        That is with so many times as many baseline runs; 1 if these tests are enough, infinite beyond a million times.
+        Baseline runs are ``more_runs`` times as many. It is 1 if these tests are enough, infinite beyond a million.
         """
-        n, times, width = self.design.n_within(statement), 1.0, 2.0 * rhw * self.limits(level, statement).rate
+        n, width = self.design.n_within(statement), 2.0 * rhw * self.limits(level, statement).rate
+        times = 1.0
         p, tally = self.design.p[:n], self.tally.part(slice(0, n))
         variance = pool_variance(p, tally, self.design.n_independent) / more_runs
 
@@ -269,48 +271,49 @@ class SeenShells:
         return times
 
     def events_for(self, times: float) -> float:
-        """How many times the events that the pool keeps so many times the tests would need; at least 1."""
-        kept = np.resize(self.design.available or math.inf, self.tally.tests.size)
-        some = (kept > 0) & (self.tally.tests > 0)  # infinitely often none is none
-        return max(float(np.max(self.tally.tests[some] * times / kept[some], initial=1.0)), 1.0)
+        """Factor on the events that the pool keeps for so many ``times`` the tests; at least 1."""
+        available = np.resize(self.design.available or math.inf, self.tally.tests.size)
+        limited = (available > 0) & (self.tally.tests > 0)  # 0 · infinity is no number
+        return max(float(np.max(self.tally.tests[limited] * times / available[limited], initial=1.0)), 1.0)
 
     def _limits(self, end: int, level: Level, begin: int = 0) -> RateLimits:
-        """Of strata ``begin … end - 1``; anything is possible where crashes lie on too few paths."""
+        """Rate and limits of strata ``begin … end - 1``; the limits are 0 and 1 where crashes lie on too few paths."""
         p, tally = self.design.p[begin:end], self.tally.part(slice(begin, end))
-        found = RateLimits(tally.rate(p), 0.0, 1.0, math.inf, math.inf)
+        limits = RateLimits(tally.rate(p), 0.0, 1.0, math.inf, math.inf)
         if not (few := paths_that_count(p, tally) < FEWEST_PATHS):
-            found = combined(p, tally, self.design.n_independent, level)
+            limits = combined(p, tally, self.design.n_independent, level)
             if paths_that_count(p, tally.failed_as_crashes()) < FEWEST_PATHS:
-                found = found._replace(high=1.0)
+                limits = limits._replace(high=1.0)
         testable = np.resize(self.design.available[begin:end] or 1, p.size) > 0
         # Crashes of strata that are still to be tested may lie on other paths.
         to_come = tally.runs is not None and bool((tally.tests[testable] == 0).any())
         if to_come or (few and paths_that_count(p, tally, -ROOM) >= FEWEST_PATHS):
-            found = found._replace(from_pool_at_least=0.0)
-        return found
+            limits = limits._replace(from_pool_at_least=0.0)
+        return limits
 
     def _cautions(self) -> tuple[Note, ...]:
-        n_paths, n = self.design.n_paths, paths_that_count(self.design.p, self.tally)
+        n = paths_that_count(self.design.p, self.tally)
         if n >= FEWEST_PATHS:
             return ()
-        needed = two_digits_up(n_paths * FEWEST_PATHS / max(n, 1.0))
-        return (note("few_paths", n=max(n, 1.0), of=n_paths, least=FEWEST_PATHS, needed=needed),)
+        needed = two_digits_up(self.design.n_paths * FEWEST_PATHS / max(n, 1.0))
+        return (note("few_paths", n=max(n, 1.0), of=self.design.n_paths, least=FEWEST_PATHS, needed=needed),)
 
     def within(self, confidence: float) -> Within:
         """What holds of a vehicle that crashes only inside the boundary."""
-        design, tally, named = self.design, self.tally, ("n_episodes", "n_crashes", "n_failed")
-        n, level = design.n_inside, Level.two_sided(confidence)
-        inside, outside, limits = tally.part(slice(0, n)), tally.part(slice(n, None)), self._limits(n, level)
-        level = Level.of_bound(confidence, outside.totals[0])
+        design, n = self.design, self.design.n_inside
+        inside, outside = self.tally.part(slice(0, n)), self.tally.part(slice(n, None))
+        limits = self._limits(n, Level.two_sided(confidence))
+        bound = self._limits(design.p.size, Level.of_bound(confidence, outside.totals[0]), n)
         crashed = sorted(episode for s, episodes in self._crashed.items() if s >= n for episode in episodes)
-        counts: dict[str, Any] = dict(zip(named, inside.totals, strict=True))
-        counts |= zip((f"{name}_outside" for name in named), outside.totals, strict=True)
+        names = "n_episodes", "n_crashes", "n_failed"
+        counts: dict[str, Any] = dict(zip(names, inside.totals, strict=True))
+        counts |= zip((f"{name}_outside" for name in names), outside.totals, strict=True)
         return Within(
             boundary=design.boundary, n_shells=n, crash_rate=limits.rate, ci_low=limits.low, ci_high=limits.high,
             rhw=limits.rhw, rhw_from_pool=limits.from_pool_relative()[0],
             crash_rate_if_failed_had_crashed=inside.failed_as_crashes().rate(design.p[:n]),
             refuted=outside.totals[1] > 0, refuted_by=tuple(crashed[:MOST_NAMED]),
-            upper_bound_outside=self._limits(design.p.size, level, n).high, **counts,
+            upper_bound_outside=bound.high, **counts,
         )  # fmt: skip
 
     def _shells(self, tail: float) -> tuple[Shell, ...]:
@@ -328,18 +331,18 @@ class SeenShells:
         return tuple(shell(s, name) for s, name in enumerate(design.strata))
 
     def _warnings(self, free: RateLimits) -> list[Note]:
-        design, tally, found = self.design, self.tally, list[Note]()
+        design, tally, notes = self.design, self.tally, list[Note]()
         if empty := [name for name, n in zip(design.strata, tally.tests, strict=True) if n == 0]:
-            found.append(note("untested", shells=empty))
-        (n, n_crashes, n_failed), outside = tally.totals, int(tally.crashes[design.n_inside :].sum())
+            notes.append(note("untested", shells=empty))
+        n, n_crashes, n_failed = tally.totals
         if design.shadow_runs and n_crashes and free.low <= 0.0 and free.from_pool < math.inf:
             alone, _ = free.from_pool_relative()
-            found.append(note("runs_leave_nothing", n=n_crashes, runs=design.n_paths, alone=alone))
-        kept = zip(design.strata, tally.tests, design.available, strict=False)
-        if used_up := [name for name, tests, available in kept if tests >= available > 0]:
-            found.append(note("used_up", shells=used_up))
-        if outside:
-            found.append(note("refuted", n=outside, boundary=design.boundary))
+            notes.append(note("runs_leave_nothing", n=n_crashes, runs=design.n_paths, alone=alone))
+        shells = zip(design.strata, tally.tests, design.available, strict=False)
+        if used_up := [name for name, tests, available in shells if tests >= available > 0]:
+            notes.append(note("used_up", shells=used_up))
+        if outside := int(tally.crashes[design.n_inside :].sum()):
+            notes.append(note("refuted", n=outside, boundary=design.boundary))
         if n_failed:
-            found.append(note("failed", n=n_failed, of=n))
-        return found
+            notes.append(note("failed", n=n_failed, of=n))
+        return notes

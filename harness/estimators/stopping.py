@@ -56,10 +56,10 @@ Ended = Literal["rhw", "accept", "below_reference"]
 
 
 def decision_level(expected: float, confidence: float) -> Level:
-    """At which a look decides, so that all looks together err in (1 - confidence)/2 of campaigns a side.
+    """The level at which one look decides, so that all looks together err in (1 - confidence)/2 of campaigns a side.
 
-    ``expected`` crashes see `DECISION_THRESHOLDS`. The threshold is one for few crashes and many; the pool's error has
-    the quantile that belongs to it.
+    ``expected`` crashes see `DECISION_THRESHOLDS`. The threshold is the same for few crashes and many; the pool's error
+    has the quantile that belongs to it.
     """
     threshold = next(threshold for most, threshold in DECISION_THRESHOLDS if expected < most)
     threshold = max(threshold + math.log(2.0 * DECISION_TAIL / (1.0 - confidence)), 0.5)
@@ -149,30 +149,31 @@ class Rule:
         rhw: float,
         n_crashes: int,
         *,
-        of: str = "rhw",
+        key: str = "rhw",
         one_more_crash: float = 0.0,
         after_first_tests: bool = False,
         also: Note | None = None,
         pool: tuple[float, float] = (0.0, 0.0),
     ) -> bool:
-        """Note a look at a precision, ``of`` which it is, and say whether to stop.
+        """Record a look at a precision, and say whether to stop; ``key`` is that of its note.
 
-        ``one_more_crash`` is by how much of itself one of the largest weight would have moved the estimate; ``also`` is
-        what was waited for besides, if nothing is unmet; ``pool`` has the half-widths that the pool's own error would
-        leave by itself, as it was seen, and at least.
+        ``one_more_crash`` is the share by which one more crash, of the largest weight, would have moved the estimate;
+        ``also`` is what was waited for if nothing else is unmet; ``pool`` has the half-widths that the pool's own error
+        would leave alone, as it was seen, and at least.
         """
         if (target := self.target) is None:
             self.look = Look(rhw)
             return False
-        met = [
-            (note(of, target=target), rhw <= target),
+        conditions = [
+            (note(key, target=target), rhw <= target),
             (note("one_more_crash", target=target), one_more_crash <= target),
             (note("min_crashes", least=self._min_crashes), n_crashes >= self._min_crashes),
             (note("first_tests"), not (after_first_tests and self.of_first_tests)),
         ]
-        unmet = tuple(condition for condition, is_met in met if not is_met)
+        unmet = tuple(condition for condition, is_met in conditions if not is_met)
         self._passes = 0 if unmet else self._passes + 1
-        stopped, too_rough = self._passes >= self._needed, pool[1] > target
+        stopped = self._passes >= self._needed
+        too_rough = pool[1] > target
         unmet = unmet or ((also,) if also else self.look.unmet)
         self.look = Look(rhw, "rhw" if stopped else None, unmet, too_rough, pool[0])
         return stopped or (too_rough and pool[0] ** 2 >= POOL_SHARE * rhw**2)
@@ -196,10 +197,7 @@ def look_grid(n_episodes: int, shard_ends: Sequence[int], ratio: float = LOOK_RA
 
 
 class StopRule(Rule):
-    """Fed with the estimate of weighted tests at each look in turn.
-
-    `observe` wants the estimate of the campaign's own estimator, ``looks`` are the numbers of episodes at which.
-    """
+    """Looks at the estimate of weighted tests, by the campaign's own estimator, at ``looks``: numbers of episodes."""
 
     _needed = 2
 
@@ -215,7 +213,8 @@ class StopRule(Rule):
     def observe(self, n: int, estimate: Estimate) -> bool:
         """Whether to stop after the look at ``n`` episodes, the next of `looks`, with the estimate of exactly these."""
         self._n_looks += 1
-        last, total = self._n_looks == len(self.looks), n * estimate.crash_rate
+        last = self._n_looks == len(self.looks)
+        total = n * estimate.crash_rate
         one_more = estimate.weight_cap / total if total > 0.0 else math.inf
         also = note("second_look") if last and self._passes == 0 else None
         return self._looked(estimate.precision, estimate.n_crashes, one_more_crash=one_more, also=also) or last
@@ -224,9 +223,9 @@ class StopRule(Rule):
 class RoundRule(Rule):
     """Looks at the crash rate from shells after each round, of one scenario or of the sum of several per hour.
 
-    Or whether it is below a limit, which is decided by ``level_at`` an expected number of crashes and a confidence,
-    whatever the budget: a run that is continued is looked at where it would have been without the break, and once more
-    where that was. Before the tests ``held`` by the run folder nothing is given up, whatever is asked for now.
+    If a limit is asked about, it waits for the decision whether the rate is below it, at ``level_at`` an expected
+    number of crashes and a confidence, whatever the budget: a run that is continued is looked at where it would have
+    been without the break, and once more where that was. It gives nothing up before the tests ``held`` by the folder.
     """
 
     level_at = staticmethod(decision_level)
@@ -239,21 +238,23 @@ class RoundRule(Rule):
 
     def observe(self, seen: SeenShells | PerHour) -> bool:
         """Whether to stop at the end of a round, with all tests so far."""
-        self.seen, (n, n_crashes, _) = seen, seen.totals
+        self.seen = seen
+        n, n_crashes, _ = seen.totals
         if self._accept is not None:
             return self._decided(seen, self._accept) and n >= self._held
         level = Level.two_sided(self._confidence)
         limits, limit = seen.limits(level, self._statement), self._below_reference
-        of_each = [of.limits(level).rhw for of in seen.families] if self._each and isinstance(seen, PerHour) else []
+        of_families = seen.families if self._each and isinstance(seen, PerHour) else ()
+        rhws = [family.limits(level).rhw for family in of_families]
         also = note("first_tests") if self.of_first_tests else None
         pool = limits.from_pool_relative() if n_crashes >= self._min_crashes else (0.0, 0.0)
-        enough = self._looked(max(of_each, default=limits.rhw), n_crashes, also=also, pool=pool)
-        if not self.look.stopped and limit is not None and not of_each and self._is_below(seen, limit, limits.high):
+        enough = self._looked(max(rhws, default=limits.rhw), n_crashes, also=also, pool=pool)
+        if not self.look.stopped and limit is not None and not rhws and self._is_below(seen, limit, limits.high):
             self.look = replace(self.look, ended="below_reference", unmet=(note("below_reference", limit=limit),))
         return self.look.stopped or (enough and n >= self._held)
 
     def _is_below(self, seen: SeenShells | PerHour, limit: float, high: float) -> bool:
-        """Whether the rate, ``high`` at most, is below a multiple of a reference driver's, as decisions are made."""
+        """Whether the rate, ``high`` at most, is known to be below ``limit`` times that of a reference driver."""
         if (first := seen.first_reference) is None:
             return False
         driver, rate = first
@@ -271,36 +272,37 @@ class RoundRule(Rule):
         """Look at a limit until it is decided; that answer stays, also while the folder holds further tests."""
         if not self.look.stopped:
             key, limit, driver = accept.asked
-            found = self._beside(seen, limit, driver)
+            decision = self._beside(seen, limit, driver)
             rhw = seen.limits(Level.two_sided(self._confidence), self._statement).rhw
-            ended: Ended | None = None if found.verdict == "undecided" else "accept"
-            if found.verdict == "accepted":
-                found = replace(found, n_runs=self._runs_needed(seen, found))
+            ended: Ended | None = None if decision.verdict == "undecided" else "accept"
+            if decision.verdict == "accepted":
+                decision = replace(decision, n_runs=self._runs_needed(seen, decision))
             if ended and isinstance(seen, PerHour):
                 level = self.level_at(seen.expected(limit, driver, self._statement), self._confidence)
-                over = seen.limits_over_assumed(level, ratio=driver is not None)
-                found = replace(found, over_assumed=over)
-            self.look = Look(rhw, ended, (note("accept", asked=key, limit=limit),), decision=found)
+                ends = seen.limits_over_assumed(level, ratio=driver is not None)
+                decision = replace(decision, over_assumed=ends)
+            self.look = Look(rhw, ended, (note("accept", asked=key, limit=limit),), decision=decision)
         return self.look.stopped
 
-    def _runs_needed(self, seen: SeenShells | PerHour, found: Decision) -> int:
-        """Baseline runs to see what would break the limit if it crashed on all events; 0 where there are enough.
+    def _runs_needed(self, seen: SeenShells | PerHour, decision: Decision) -> int:
+        """Number of baseline runs that would show what may break the limit; 0 where there are enough.
 
-        However many tests there are, they repeat these runs: what a vehicle that acts before the event does in a share
-        of drives below the upper limit of 0 of n, none of n runs may show.
+        However many tests there are, they repeat these runs. What a vehicle that acts before the event does in a share
+        of drives below the upper limit of 0 of n, none of n runs may show; it may crash on all events then.
         """
         if isinstance(seen, PerHour):
-            each = [(of.p, of.seen.design) for of in seen.families]
+            masses = [(family.p, family.seen.design) for family in seen.families]
         else:
-            each = [(seen.design.p, seen.design)]
-        repeats = [(float(p.sum()), design.n_independent) for p, design in each if design.shadow_runs]
-        if not repeats:
+            masses = [(seen.design.p, seen.design)]
+        on_runs = [(float(p.sum()), design.n_independent) for p, design in masses if design.shadow_runs]
+        if not on_runs:
             return 0
-        runs = min(n for _, n in repeats)
-        unseen = float(clopper_pearson(0, runs, 1.0 - found.confidence)[1])
-        share = math.fsum(p for p, _ in repeats) / math.fsum(float(p.sum()) for p, _ in each)
-        times = share * unseen * found.n_episodes / seen.expected(found.limit, found.driver, ASSUMPTION_FREE)
-        return two_digits_up(runs * times) if times > 1.0 else 0
+        n_runs = min(n for _, n in on_runs)
+        unseen = float(clopper_pearson(0, n_runs, 1.0 - decision.confidence)[1])
+        share = math.fsum(p for p, _ in on_runs) / math.fsum(float(p.sum()) for p, _ in masses)
+        expected = seen.expected(decision.limit, decision.driver, ASSUMPTION_FREE)
+        times = share * unseen * decision.n_episodes / expected
+        return two_digits_up(n_runs * times) if times > 1.0 else 0
 
 
 class PairRule(Rule):
@@ -330,9 +332,9 @@ class PairRule(Rule):
         if self.decision.margin is not None and watched.n_crashes:
             _, low, high = watched.ratio(self._level(watched))
             self.decision = replace(self.decision, ratio=(1.0 / high, 1.0 / low if low > 0.0 else math.inf))
-        pool = watched.rhw_from_pool(level)
-        found, of = (watched.rhw(level), pairs.n_crashes), "rhw_of_difference"
-        given_up = self._looked(*found, of=of, after_first_tests=True, pool=(pool, pool))
+        pool = (watched.rhw_from_pool(level),) * 2
+        rhw, key = watched.rhw(level), "rhw_of_difference"
+        given_up = self._looked(rhw, pairs.n_crashes, key=key, after_first_tests=True, pool=pool)
         if not self.ends_at_rhw:
             ended = self.look.ended
             if self.decision.verdict != "open":

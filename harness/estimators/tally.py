@@ -71,17 +71,17 @@ class Tally(NamedTuple):
         return cls(tests, crashes, failed, *np.zeros((2, tests.size, tests.size)))  # which may be added to, each
 
     def part(self, strata: slice) -> Tally:
-        """That of some strata."""
+        """The tally of some strata."""
         return self.joined(np.eye(self.tests.size)[:, strata])
 
     def plus(self, other: Tally) -> Tally:
-        """With further tests of the same strata; whose runs are not known."""
+        """The tally with further tests of the same strata; without ``runs``."""
         counts = self.tests + other.tests, self.crashes + other.crashes, self.failed + other.failed
         return Tally(*counts, self.crash_mass + other.crash_mass, self.failed_mass + other.failed_mass)
 
     def joined(self, groups: FloatArray) -> Tally:
-        """That of groups of strata: ``groups``, shape (S, G), is 1 where a stratum belongs to one."""
-        tests, crashes, failed = (np.rint(each @ groups).astype(np.int64) for each in self[:3])
+        """The tally of groups of strata: ``groups``, shape (S, G), is 1 where a stratum belongs to one."""
+        tests, crashes, failed = (np.rint(counts @ groups).astype(np.int64) for counts in self[:3])
         masses = groups.T @ self.crash_mass @ groups, groups.T @ self.failed_mass @ groups
         return Tally(tests, crashes, failed, *masses, self.runs and self.runs.joined(groups))
 
@@ -89,10 +89,10 @@ class Tally(NamedTuple):
         """The same tests, had all failed ones crashed; with ``where``, shape (S,) bool, those of some strata alone."""
         if not self.failed.any():
             return self
-        counted = np.ones(self.tests.size, np.bool_) if where is None else where
-        failed, mass = self.failed * counted, self.failed_mass * counted[:, None]
+        chosen = np.ones(self.tests.size, np.bool_) if where is None else where
+        failed, mass = self.failed * chosen, self.failed_mass * chosen[:, None]
         masses = self.crash_mass + mass, self.failed_mass - mass
-        runs = self.runs and self.runs.failed_as_crashes(counted)
+        runs = self.runs and self.runs.failed_as_crashes(chosen)
         return Tally(self.tests, self.crashes + failed, self.failed - failed, *masses, runs)
 
     @property
@@ -116,7 +116,7 @@ class Tally(NamedTuple):
 
 
 def empty_tally(n_strata: int) -> Tally:
-    """That of no tests."""
+    """The tally of no tests."""
     return Tally.counted(*np.zeros((3, n_strata), np.int64))
 
 
@@ -130,7 +130,7 @@ class CrashedTests(NamedTuple):
 
 
 class OnRuns(NamedTuple):
-    """Which baseline runs crashed tests repeat, and failed ones: what tells the error of few paths, without a bound.
+    """Which baseline runs the crashed and failed tests repeat: it tells the error of few paths, which a bound cannot.
 
     The pool of a vehicle that acts before the event knows some hundred paths, of which G_i is each one's weighted
     probability of a crash. A crashed test is a draw of an event in proportion to its probability m. So Σ y m over these
@@ -148,7 +148,7 @@ class OnRuns(NamedTuple):
 
     @classmethod
     def of(cls, n_runs: int, n_strata: int, tests: CrashedTests) -> OnRuns:
-        """Of crashed and failed tests."""
+        """What these crashed and failed tests say."""
         run, step, mass, place = tests
 
         def same(keys: NDArray[Any]) -> FloatArray:
@@ -160,19 +160,19 @@ class OnRuns(NamedTuple):
         own = np.bincount(place, mass, minlength=2 * n_strata).astype(np.float64)
         return cls(n_runs, own, same(run) - same(run + 1j * step))
 
-    def _mapped(self, to: FloatArray) -> OnRuns:
-        return OnRuns(self.n_runs, self.own @ to, to.T @ self.pairs @ to)
+    def _mapped(self, groups: FloatArray) -> OnRuns:
+        return OnRuns(self.n_runs, self.own @ groups, groups.T @ self.pairs @ groups)
 
     def joined(self, groups: FloatArray) -> OnRuns:
-        """That of groups of strata, see `Tally.joined`."""
-        none = np.zeros_like(groups)
-        return self._mapped(np.block([[groups, none], [none, groups]]))
+        """The same of groups of strata, see `Tally.joined`."""
+        zeros = np.zeros_like(groups)
+        return self._mapped(np.block([[groups, zeros], [zeros, groups]]))
 
     def failed_as_crashes(self, where: BoolArray) -> OnRuns:
         """The same tests, had the failed ones of some strata (S,) crashed."""
-        to, s = np.eye(self.own.size), where.size
-        to[s:, :s], to[s:, s:] = np.diag(where), np.diag(~where)
-        return self._mapped(to)
+        groups, s = np.eye(self.own.size), where.size
+        groups[s:, :s], groups[s:, s:] = np.diag(where), np.diag(~where)
+        return self._mapped(groups)
 
     def n_pairs(self, strata: BoolArray) -> float:
         """Pairs of crashed tests of one run, in different steps, within some strata (S,)."""
@@ -181,8 +181,8 @@ class OnRuns(NamedTuple):
     def square(self, scale: FloatArray, tally: Tally, errors: float = 0.0) -> float:
         """Estimate of the mean of G² over paths, each crash of a stratum counting ``scale`` (S,).
 
-        ``errors`` are standard errors of the variance on top of it, or below; pairs tell how large one is. Without a
-        pair nothing is known above, and below nothing but the square of the mean.
+        ``errors`` are standard errors of the variance that are added, or taken off if negative; the number of pairs
+        tells how large one is. Without a pair the mean of G² is at least the square of the mean, and has no upper end.
         """
         s, n = scale.size, self.n_pairs(scale > 0.0)
         pairs = self.pairs[:s, :s] + np.diag(self.pairs.diagonal()[:s] / np.maximum(tally.tests - 1, 1))
@@ -191,15 +191,15 @@ class OnRuns(NamedTuple):
             return square
         if n == 0.0:
             return math.inf if errors > 0.0 else 0.0
-        of_mean = float(scale @ tally.crashes) ** 2
-        excess = max(square - of_mean, 0.0) * max(1.0 + errors * math.sqrt(2.0 / n), 0.0)
+        square_of_mean = float(scale @ tally.crashes) ** 2
+        excess = max(square - square_of_mean, 0.0) * max(1.0 + errors * math.sqrt(2.0 / n), 0.0)
         if n < FEW_PAIRS and errors > 0.0:
             excess += 2.0 * self.n_runs * float(np.max(scale[tally.crashes > 0], initial=0.0)) ** 2
-        return of_mean + excess
+        return square_of_mean + excess
 
 
 def paths_that_count(p: FloatArray, tally: Tally, errors: float = 0.0) -> float:
-    """Of how many equal paths crashes would lie as close together: (ΣG)²/ΣG²; infinite while little is known.
+    """On how many equally likely paths crashes would lie as close together: (ΣG)²/ΣG²; infinite while little is known.
 
     If nearly all crashes lie on a few paths, as those of a vehicle that gives way do, then paths which would matter
     most may well be missing, and nothing in the tests says so. ``errors`` see `OnRuns.square`.
@@ -231,7 +231,7 @@ def crash_square(scale: FloatArray, tally: Tally, errors: float = ROOM) -> float
 
 
 def mean_square(scale: FloatArray, crash_mass: FloatArray) -> float:
-    """The bound.
+    """The bound of Σ E[x_s x_t].
 
     A crashed test of s is a draw in proportion to x_s, so that B_st, p_s/n_s (``scale``, shape (S,)) times the sum of
     the paths' whole probabilities m_t in t over these tests (``crash_mass``, shape (S, S)), estimates E[x_s m_t], which

@@ -86,14 +86,15 @@ def uncertain(
     from_below: bool = True,
     held: bool = True,
 ) -> Uncertain:
-    """By the factors (B,) of replicates, each over that of the environment itself, that may be ``off`` (B,) by so much.
+    """What replicates leave open of a value: ``factors`` (B,) by which it moves, each ``off`` (B,) by so much at most.
 
-    Not ``from_below`` there is an upper limit alone; not ``held`` factors are of the upper limit, not of the value.
+    Unless ``from_below`` there is an upper limit alone; unless ``held`` the factors are of the upper limit.
     """
     tail = round((1.0 - confidence) / 2.0, 12)  # so that it falls on one of them where it should
-    lower, upper = np.append(factors / (1.0 + off), np.zeros(n_refused)), factors * (1.0 + off)
+    lower = np.append(factors / (1.0 + off), np.zeros(n_refused))
+    upper = np.append(factors * (1.0 + off), np.full(n_refused, np.inf))
     low = float(np.quantile(lower, tail, method="lower")) if from_below else 0.0
-    high = float(np.quantile(np.append(upper, np.full(n_refused, np.inf)), 1.0 - tail, method="higher"))
+    high = float(np.quantile(upper, 1.0 - tail, method="higher"))
     if value <= 0.0 or not held:
         return Uncertain(value, (low, high), sampling, (0.0, 0.0), (0.0, sampling[1] * high))
     environment = value * low, value * high
@@ -136,7 +137,7 @@ class Bar:
 
 def tests_of_sum(content: Mapping[str, Any]) -> str:
     """What the sum of several scenarios is known by, in the place of a campaign's hash: its tests and exposures."""
-    exposures = (f"{of['exposure']['per_hour']:g}" for of in content["families"].values())
+    exposures = (f"{family['exposure']['per_hour']:g}" for family in content["families"].values())
     return "-".join([f"{content.get('campaign_crc32')}", f"{content['n_episodes']}", *exposures])
 
 

@@ -147,29 +147,29 @@ class Nade:
 
     def cautions(self) -> list[Note]:
         """Why an interval around a mean of these Y may be wrong."""
-        found = []
+        notes = []
         if math.isfinite(self._design_cap) and self._largest_y > self._design_cap * (1.0 + 1e-9):
-            found.append(note("contradicts_design", weight=self._largest_y, cap=self._design_cap))
+            notes.append(note("contradicts_design", weight=self._largest_y, cap=self._design_cap))
         cap, _ = self.cap()
         if not math.isfinite(cap):
-            found.append(note("unbounded"))
+            notes.append(note("unbounded"))
         elif self.n_crashes and (times := cap / self.y.total) > OVERTURNS:
             more = note("one_may_weigh", cap=cap, seen=self.y.total), note("one_more_adds", times=times)
-            found.append(more[0] if cap > 1.0 else more[1])
-        return found
+            notes.append(more[0] if cap > 1.0 else more[1])
+        return notes
 
     def warnings(self, half_width: float) -> list[Note]:
         """What else a reader of a mean of these Y should know, beside an interval of this half-width."""
-        found, effective, (cap, origin) = self._few_crashes(), self.y.n_effective, self.cap()
+        notes, effective, (cap, origin) = self._few_crashes(), self.y.n_effective, self.cap()
         if 0.0 < effective < FEW_EFFECTIVE:
-            found.append(note("few_effective", n=effective, least=FEW_EFFECTIVE))
+            notes.append(note("few_effective", n=effective, least=FEW_EFFECTIVE))
         if self.largest_share() > LARGE_SHARE:
-            found.append(note("one_carries", share=self.largest_share()))
+            notes.append(note("one_carries", share=self.largest_share()))
         if origin == "tests" and not self.is_settled():
-            found.append(note("bound_rests", cap=origin))
+            notes.append(note("bound_rests", cap=origin))
         if 0.0 < half_width < cap / self.n <= OVERTURNS * self.y.mean(self.n):  # beyond that there is a caution
-            found.append(note("one_more_moves", cap=cap, by=cap / self.n))
-        return found
+            notes.append(note("one_more_moves", cap=cap, by=cap / self.n))
+        return notes
 
     def result(self, confidence: float) -> Estimate:
         """Mean of Y with its interval."""

@@ -212,7 +212,7 @@ def with_lateral(row: pa.Table, trace: pa.Table, family: Family, environment: En
 
 
 def share_over(track: pa.Table) -> FloatArray:
-    """Where a vehicle is between the left lane (0) and the right one (1), for each row of its trace and until it is over.
+    """Where a vehicle is between the left lane (0) and the right one (1), each row of its trace and until it is over.
 
     Where lane changes take time its record ends at the overlap; from there on it moves on sideways as fast.
     """
