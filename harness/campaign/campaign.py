@@ -46,11 +46,11 @@ def _shipped(value: Any) -> Any:
         return OwnSurrogate.model_validate(value) if isinstance(value, dict) and "controller" in value else value
     from harness.vehicles.library import shipped_drivers  # noqa: PLC0415 - libraries read campaigns' sections
 
-    if value not in (known := shipped_drivers()):
-        expected = f"model and parameters of a driver, my.py:Model, or the name of a shipped one ({listed(known)})"
-        mend = did_you_mean(value, list(known)) or "Write one that is like yours: any leaves rates unbiased."
+    if value not in (drivers := shipped_drivers()):
+        expected = f"model and parameters of a driver, my.py:Model, or the name of a shipped one ({listed(drivers)})"
+        mend = did_you_mean(value, list(drivers)) or "Write one that is like yours: any leaves rates unbiased."
         raise broken_rule("", f"'{value}'", expected, mend)
-    return known[value].model_dump()
+    return drivers[value].model_dump()
 
 
 _Shipped = BeforeValidator(_shipped, json_schema_input_type=Surrogate | str)
@@ -103,19 +103,19 @@ class Campaign(Section):
         return self
 
     def of_family(self, name: str) -> Campaign:
-        """The campaign of one of its scenarios; ``environment`` is that of cut-ins where others are beside them."""
-        given: dict[str, Any] = {}
-        if name != DEFAULT_FAMILY:  # where the vehicle drives from the start in any case
+        """The campaign of one of its scenarios; ``environment`` itself is that of cut-ins."""
+        changes: dict[str, Any] = {}
+        if name != DEFAULT_FAMILY:  # in the others the vehicle drives from the start in any case
             own = EnvironmentSettings(parameters=self.environments.get(name, DEFAULT))
-            given = {"environment": own, "av": self.av.replaced(("before_event",), "hold_speed")}
+            changes = {"environment": own, "av": self.av.replaced(("before_event",), "hold_speed")}
         stop = self.stop.model_copy(update={"each_family": False})
         return self.model_copy(
-            update={"scenario": name, "scenarios": None, "exposure": {}, "environments": {}, "stop": stop, **given}
+            update={"scenario": name, "scenarios": None, "exposure": {}, "environments": {}, "stop": stop, **changes}
         )
 
     @property
     def sampling(self) -> Sampling:
-        """What is to be known of its method, ``testing.method``."""
+        """How its method, ``testing.method``, draws tests."""
         return SAMPLING[self.testing.method]
 
     @property
@@ -132,8 +132,8 @@ class Campaign(Section):
 
     @property
     def own_surrogates(self) -> dict[str, str]:
-        """Classes of the user's own among the surrogates, by name."""
-        return {name: of.controller for name, of in self.surrogates.items() if isinstance(of, OwnSurrogate)}
+        """Surrogates that are classes of the user's own: ``my.py:Class`` by name."""
+        return {name: driver.controller for name, driver in self.surrogates.items() if isinstance(driver, OwnSurrogate)}
 
     @property
     def importance_names(self) -> tuple[str, ...]:
@@ -144,15 +144,16 @@ class Campaign(Section):
     @property
     def mixture_weights(self) -> tuple[float, ...]:
         """Weights α of the importance functions, in the order of `importance_names`, summing to 1."""
-        names, given = self.surrogates if self.sampling.mixes else (), self.testing.alpha
-        alpha = tuple(given[name] if given else 1.0 / len(names) for name in names)
+        names = self.surrogates if self.sampling.mixes else ()
+        chosen = self.testing.alpha
+        alpha = tuple(chosen[name] if chosen else 1.0 / len(names) for name in names)
         if not self.sampling.forces:
             return alpha
         share = self.testing.defensive_share if alpha else 1.0
         return (share, *((1.0 - share) * weight for weight in alpha))
 
     def content_hash(self, environment_parameters: str, challenge: str | None = None) -> str:
-        """Hash of everything that changes an episode's bits; ``challenge`` is known of one of the user's own.
+        """Hash of everything that changes an episode's bits; ``challenge`` is the hash of one of the user's own.
 
         Cells, workers, estimator, stop rule, trace policy and names are left out, so that a campaign can be continued.
         """
@@ -183,7 +184,7 @@ Command = Literal["run", "compare", "av-check"]
 
 
 class Use(NamedTuple):
-    """The command (none while it is read), whether cut-ins take time, and the AV ``follows`` from the start."""
+    """The command (none while a campaign is read), whether cut-ins take time, whether the AV follows from the start."""
 
     command: Command | None = None
     shows: bool = False
@@ -361,10 +362,11 @@ REFUSED = (
 
 def refusal(campaign: Campaign, use: Use | None = None) -> tuple[str, str, str, str] | None:
     """Where, found, expected and mend of the first combination that is refused; None if the campaign may go on."""
-    values, while_read = dict(campaign), Use()
+    while_read = Use()
     use = use or while_read
     for row in REFUSED:
         # A command may change a campaign that has been read: what it was allowed with then is not asked again.
         if row.is_asked(campaign, use) and not (use != while_read and row.is_asked(campaign, while_read)):
+            values = dict(campaign)
             return row.where, row.found.format(**values), row.expected.format(**values), row.mend
     return None

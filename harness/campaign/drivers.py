@@ -14,7 +14,6 @@ MAX_CONFIGURED_SPEED_MPS = 60.0
 NATURAL = "natural"
 """Headway that people keep."""
 
-
 Strength = Annotated[float, Field(gt=0.0, le=20.0)]
 Braking = Annotated[float, Field(ge=-20.0, le=0.0)]
 Gap = Annotated[float, Field(ge=0.0, le=50.0)]
@@ -98,7 +97,7 @@ class ReferenceParameters(Following):
 
     @property
     def used_up_steps(self) -> float:
-        """How much of its reaction time has passed by the cut-in, if that is the danger; in steps."""
+        """How much of its reaction time has passed by a dangerous cut-in, in steps."""
         return 10.0 * self.evaluated_at_m / self.lateral_speed_mps
 
     @property

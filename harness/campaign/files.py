@@ -64,16 +64,16 @@ def load_campaign(
 
     Raises `CampaignError`: the file cannot be read, is not YAML, or says something wrong; the error names every place.
     """
-    laid = [] if av is None else [Override(("av",), named_vehicle(av, "--av "), f"--av {av}")]
+    vehicle = [] if av is None else [Override(("av",), named_vehicle(av, "--av "), f"--av {av}")]
     of_file = names_a_campaign(path)
     data, lines = read_yaml(path) if of_file else (_default_campaign(str(path)), {})
-    typed = [parse_override(each) for each in overrides]
-    place = Places(str(path), lines, [*laid, *_nothing_sooner(typed), *typed])
+    typed = [parse_override(text) for text in overrides]
+    place = Places(str(path), lines, [*vehicle, *_nothing_sooner(typed), *typed])
     campaign = validated(data, Campaign, place)
-    if campaign.accept is not None and not any(each.path[0] == "accept" for each in typed):
-        for each in filter(_asks_for_precision, typed):
+    if campaign.accept is not None and not any(override.path[0] == "accept" for override in typed):
+        for override in filter(_asks_for_precision, typed):
             found, expected = "a precision, in a campaign with a limit", "one of the two: a limit ends it at a decision"
-            raise CampaignError(each.option, found, expected, "Add --set accept=null.")
+            raise CampaignError(override.option, found, expected, "Add --set accept=null.")
     folder = Path(path).parent
     campaign = _with_real_paths(campaign, place, folder if of_file else Path.cwd(), check_files=check_files)
     if check_files:
@@ -90,9 +90,9 @@ def load_campaign(
 
 
 def _with_real_paths(campaign: Campaign, place: Places, folder: Path, *, check_files: bool) -> Campaign:
-    """The campaign with every file that it names by an absolute path; one typed after ``--set`` may lie here."""
-    files = _FILES | {("environments", each): _FILES["environment", "parameters"] for each in campaign.environments}
-    files |= {("surrogates", each, "controller"): _FILES["av", "controller"] for each in campaign.own_surrogates}
+    """The campaign with absolute paths of all its files; one typed after ``--set`` may be relative to this folder."""
+    files = _FILES | {("environments", name): _FILES["environment", "parameters"] for name in campaign.environments}
+    files |= {("surrogates", name, "controller"): _FILES["av", "controller"] for name in campaign.own_surrogates}
     for where, expected in files.items():
         name, end = campaign.at(where), ""
         if where[-1] in ("controller", "estimator", "challenge") and name is not None and ".py:" in name:
@@ -118,7 +118,7 @@ def campaign_of(campaign: Campaign | str | Path) -> Campaign:
 def _absolute(value: Any, folder: Path) -> Any:
     """A path, or each of a list, that is relative to a folder; URIs, as Ray takes them, stay."""
     if isinstance(value, list):
-        return [_absolute(each, folder) for each in value]
+        return [_absolute(path, folder) for path in value]
     if isinstance(value, str) and "://" not in value:
         return str(real_path(folder / os.path.expanduser(value)))  # noqa: PTH111 - Path's own fails without a home
     return value
@@ -129,11 +129,11 @@ def _asks_for_precision(override: Override) -> bool:
 
 
 def _nothing_sooner(typed: Sequence[Override]) -> Iterator[Override]:
-    """What is asked for by hand is what ends a run: what would end it sooner holds where that is typed, too."""
-    for each in typed:
-        other_method = each.path == ("testing", "method") and each.value != "shells"
-        if other_method or each.path == ("stop", "rhw") or _asks_for_precision(each):
-            yield Override(("stop", "below_reference"), None, each.option)
+    """Overrides that switch off ``stop.below_reference``, where another end of the run was typed."""
+    for override in typed:
+        other_method = override.path == ("testing", "method") and override.value != "shells"
+        if other_method or override.path == ("stop", "rhw") or _asks_for_precision(override):
+            yield Override(("stop", "below_reference"), None, override.option)
 
 
 # -- vehicles by name --
@@ -147,7 +147,7 @@ QUICK = {"rhw": 0.3, "below_reference": 0.3}
 
 
 def names_a_campaign(path: str | Path) -> bool:
-    """Whether it is the path of a campaign, not a vehicle: a YAML file, or any that is there and is none of code."""
+    """Whether it is the path of a campaign, not a vehicle: a YAML file, or an existing one that is not code."""
     suffix, text = Path(path).suffix, str(path)
     if suffix in (".yaml", ".yml"):
         return True
@@ -156,11 +156,11 @@ def names_a_campaign(path: str | Path) -> bool:
 
 def _default_campaign(vehicle: str) -> dict[str, Any]:
     place, _, name = vehicle.rpartition(":")
-    whole = vehicle.endswith((".fmu", ".py"))
-    words = Path(vehicle).stem if whole else f"{Path(place).name.removesuffix('.py')}-{name}"
+    is_file = vehicle.endswith((".fmu", ".py"))
+    words = Path(vehicle).stem if is_file else f"{Path(place).name.removesuffix('.py')}-{name}"
     name = re.sub(r"[^A-Za-z0-9_.-]+", "-", words).strip("-._")
-    av, for_the_player = named_vehicle(vehicle), {"traces": "crash"}
-    return {"name": name, "av": av, "stop": dict(QUICK), "records": for_the_player}
+    records = {"traces": "crash"}  # for the player
+    return {"name": name, "av": named_vehicle(vehicle), "stop": dict(QUICK), "records": records}
 
 
 def named_vehicle(text: str, option: str = "") -> dict[str, Any]:
@@ -185,13 +185,13 @@ def named_vehicle(text: str, option: str = "") -> dict[str, Any]:
         return panel[name].model_dump(exclude_unset=True)
     if name in (models := () if colon else get_args(ModelName)):
         return {"model": name}
-    known = list(dict.fromkeys((*models, *sorted(panel))))
+    names = list(dict.fromkeys((*models, *sorted(panel))))
     files = [] if colon else [str(file) for file in Path().glob("*.y*ml")]
     found = f"no vehicle '{name}' in {place}" if colon else f"no {'' if option else 'campaign file, and no '}vehicle"
     if text.endswith(".py") and not Path(text).exists():
         found, files = "no such file", [str(file) for file in Path().glob("*.py")]
-    expected = f"{'' if colon else _OTHER_FORMS}one of {', '.join(known[:FEW_NAMES])}, …"
-    mend = in_python_file(text) or did_you_mean(name, [*files, *known]) or f"Name one of them: {listed(known)}."
+    expected = f"{'' if colon else _OTHER_FORMS}one of {', '.join(names[:FEW_NAMES])}, …"
+    mend = in_python_file(text) or did_you_mean(name, [*files, *names]) or f"Name one of them: {listed(names)}."
     raise CampaignError(f"{option}{text}", found, expected, mend)
 
 
@@ -224,7 +224,7 @@ def dump_campaign(campaign: Campaign) -> str:
 
 
 def written_out(campaign: Campaign) -> dict[str, Any]:
-    """Plain data of a campaign with every default, but of the sources of an AV only the one that drives it."""
+    """Plain data of a campaign with every default; of the sources of an AV only the one that drives it."""
     several = campaign.scenarios is not None and campaign.scenario == DEFAULT_FAMILY  # which is not asked then
     data = campaign.model_dump(exclude={"scenario"} if several else None)
     left_out = {key for key in AV_SOURCES if data["av"][key] is None}

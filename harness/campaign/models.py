@@ -35,11 +35,11 @@ def validated(data: dict[str, Any], model: type[Model], place: Places) -> Model:
             parts = details["ctx"]
             where = (*_path_of(details["loc"], data), *filter(None, parts["key"].split(".")))
             found, expected = parts["found"], parts["expected"]
-            # A value of several kinds is refused once for each.
-            if (alike := problems.get((where, found))) is not None and expected not in alike.expected:
-                expected = f"{alike.expected} or {expected}"
+            # A value that may be of several kinds has an error for each kind.
+            if (same_value := problems.get((where, found))) is not None and expected not in same_value.expected:
+                expected = f"{same_value.expected} or {expected}"
             if not (mend := parts["mend"]):  # of an unknown key that resembles none beside it
-                places = dict.fromkeys(each or "the top level" for each in places_of(str(where[-1]), model))
+                places = dict.fromkeys(section or "the top level" for section in places_of(str(where[-1]), model))
                 belongs = f"'{where[-1]}' belongs under {' or '.join(places)}."
                 mend = belongs if places else "Delete it, or correct its name."
             problems[where, found] = CampaignError(place(where), found, expected, mend)
@@ -113,12 +113,12 @@ def parse_override(text: str) -> Override:
 
 
 def apply_overrides(data: dict[str, Any], overrides: Sequence[Override]) -> dict[str, Any]:
-    """A copy of ``data`` with each override, later ones over earlier ones, or a `CampaignError`: of no section."""
+    """A copy of ``data`` with each override, later ones over earlier ones; `CampaignError`: it is in no section."""
     changed = dict(data)
     # A whole vehicle replaces what was said of one before. Of the rest the driver comes first: parameters are its own.
-    whole = max((i for i, each in enumerate(overrides) if each.path == ("av",)), default=0)
-    counted = [each for i, each in enumerate(overrides) if i >= whole or each.path[0] != "av"]
-    for override in sorted(counted, key=lambda each: not _names_the_driver(each)):
+    last_vehicle = max((i for i, override in enumerate(overrides) if override.path == ("av",)), default=0)
+    counted = [override for i, override in enumerate(overrides) if i >= last_vehicle or override.path[0] != "av"]
+    for override in sorted(counted, key=lambda override: not _names_the_driver(override)):
         if _names_the_driver(override) and len(override.path) > 1:
             changed = with_another_driver(changed, override.path[1], override.value)
         if override.path[0] == "surrogates" and len(override.path) > 1 and "surrogates" not in changed:
@@ -152,7 +152,7 @@ class Places:
 
     def line_of(self, where: YamlPath) -> int:
         """Line of the value at ``where``, or of its nearest ancestor that is in the file."""
-        return next((self.lines[at] for n in range(len(where), -1, -1) if (at := tuple(where[:n])) in self.lines), 1)
+        return next((self.lines[key] for n in range(len(where), -1, -1) if (key := tuple(where[:n])) in self.lines), 1)
 
     def __call__(self, where: YamlPath) -> str:
         """``--set a.b=c``; or ``a.b (smoke.yaml:12)``, with overrides of its parts; file and line for the whole."""

@@ -22,7 +22,7 @@ NOT_THE_USERS = str(Path(__file__).parents[1]), get_path("stdlib"), get_path("pl
 
 
 def file_and_function(name: str) -> tuple[str, str]:
-    """Of ``file.py:main``; of ``file.py``, or any other name, the latter is empty."""
+    """The parts of ``file.py:main``; the function is empty in ``file.py``, or any other name."""
     file, colon, function = name.partition(".py:")
     return (f"{file}.py", function) if colon else (name, "")
 
@@ -45,48 +45,48 @@ def is_script(name: str) -> bool:
     file, function = file_and_function(name)
     if (tree := _parsed(file)) is None:
         return False
-    if tree.body and not any(each.partition(".")[0] in TRACI_MODULES for each in _imports(tree)):
+    if tree.body and not any(name.partition(".")[0] in TRACI_MODULES for name in _imports(tree)):
         return False
-    for each in tree.body:
-        if isinstance(each, ast.FunctionDef) and each.name == function:
-            given, makes = each.args, each.returns
-            required = len(given.posonlyargs) + len(given.args) - len(given.defaults) + given.kw_defaults.count(None)
-            return required == 0 and (makes is None or ast.unparse(makes) == "None")
+    for node in tree.body:
+        if isinstance(node, ast.FunctionDef) and node.name == function:
+            args = node.args
+            required = len(args.posonlyargs) + len(args.args) - len(args.defaults) + args.kw_defaults.count(None)
+            return required == 0 and (node.returns is None or ast.unparse(node.returns) == "None")
     return not function
 
 
 def _imports(tree: ast.Module) -> set[str]:
-    """Modules that are imported anywhere, and what is taken from them, which may be modules; first a dot a level."""
-    found = {alias.name for each in ast.walk(tree) if isinstance(each, ast.Import) for alias in each.names}
-    for each in ast.walk(tree):
-        if isinstance(each, ast.ImportFrom):
-            start = "." * each.level + (f"{each.module}." if each.module else "")
-            found.update(start + alias.name for alias in each.names)
-    return found
+    """Modules that are imported anywhere, and names taken from them, which may be modules; relative ones with dots."""
+    modules = {alias.name for node in ast.walk(tree) if isinstance(node, ast.Import) for alias in node.names}
+    for node in ast.walk(tree):
+        if isinstance(node, ast.ImportFrom):
+            start = "." * node.level + (f"{node.module}." if node.module else "")
+            modules.update(start + alias.name for alias in node.names)
+    return modules
 
 
 def files_imported(file: Path, root: Path) -> set[Path]:
-    """A Python file, and those below ``root``, a folder that is importable, that it and these import."""
-    found, new = set[Path](), {file}
+    """A Python file, and all below the importable folder ``root`` that it imports, directly or not."""
+    files, new = set[Path](), {file}
     while new:
-        found.add(at := new.pop())
-        for name in _imports(_parsed(str(at)) or ast.Module([], [])):
-            path = name.lstrip(".")
-            below = [root, *at.parents][: len(name) - len(path) + 1][-1].joinpath(*path.split("."))
-            for each in (below, *below.parents):
-                if not each.is_relative_to(root) or each in (root, root / "harness"):
+        files.add(current := new.pop())
+        for name in _imports(_parsed(str(current)) or ast.Module([], [])):
+            absolute = name.lstrip(".")
+            below = [root, *current.parents][: len(name) - len(absolute) + 1][-1].joinpath(*absolute.split("."))
+            for place in (below, *below.parents):
+                if not place.is_relative_to(root) or place in (root, root / "harness"):
                     break
-                new |= {it for it in (each.with_suffix(".py"), each / "__init__.py") if it.is_file()} - found
-    return found
+                new |= {each for each in (place.with_suffix(".py"), place / "__init__.py") if each.is_file()} - files
+    return files
 
 
 def in_python_file(text: str) -> str:
-    """What of a Python file may be meant; empty if it is none."""
+    """Advice which class or function of a Python file may be meant; empty if it is none."""
     if (tree := _parsed(text)) is None:
         return ""
-    found = {each.name: each for each in tree.body if isinstance(each, ast.ClassDef | ast.FunctionDef)}
-    drive = [name for name, each in found.items() if isinstance(each, ast.FunctionDef) or "step" in ast.dump(each)]
-    shown = ([name for name in drive if name[0] != "_"] or list(found))[:6]
+    definitions = {node.name: node for node in tree.body if isinstance(node, ast.ClassDef | ast.FunctionDef)}
+    drive = [name for name, n in definitions.items() if isinstance(n, ast.FunctionDef) or "step" in ast.dump(n)]
+    shown = ([name for name in drive if name[0] != "_"] or list(definitions))[:6]
     return f"Name its class or function: {' or '.join(f'{text}:{name}' for name in shown)}." if shown else ""
 
 
@@ -118,7 +118,6 @@ def import_from(folder: Path) -> None:
 
 
 def _finder(path: str) -> FileFinder:
-    """As a hook of ``sys.path_hooks``."""
     path = path or os.getcwd()  # noqa: PTH109 - as Python's own
     if not is_users(path) or not os.path.isdir(path):  # noqa: PTH112
         raise ImportError(path)

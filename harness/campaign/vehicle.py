@@ -25,21 +25,21 @@ CONTROLLER_PATTERN = r"^(.+\.py|([A-Za-z_][A-Za-z0-9_.]*|.+\.py):[A-Za-z_][A-Za-
 
 
 def with_another_driver(data: dict[str, Any], source: str, value: Any) -> dict[str, Any]:
-    """A campaign's data without what belongs to its driver alone, where another (`AV_SOURCES`) is to take its place."""
+    """A campaign's data for another driver (`AV_SOURCES`): without what belongs to the present one alone."""
     av, world = data.get("av") or {}, data.get("world")
     if not isinstance(av, dict):
         return data
-    last = next((name for name in AV_SOURCES if av.get(name) is not None), "model")
-    av = {key: each for key, each in av.items() if key == source or key not in AV_SOURCES}
-    if source != last:
-        lost = {"parameters", "reaction", "traci_style"} | ({"before_event"} if source == "model" else set())
-        lost |= {"takes_over"} if source in ("sumo", "traci") else set()
-        av = {key: each for key, each in av.items() if key not in lost}
+    current = next((name for name in AV_SOURCES if av.get(name) is not None), "model")
+    av = {key: value for key, value in av.items() if key == source or key not in AV_SOURCES}
+    if source != current:
+        belongings = {"parameters", "reaction", "traci_style"} | ({"before_event"} if source == "model" else set())
+        belongings |= {"takes_over"} if source in ("sumo", "traci") else set()
+        av = {key: value for key, value in av.items() if key not in belongings}
     elif source == "model" and isinstance(parameters := av.get("parameters"), dict) and value in PARAMETERS:
         before, after = (set(PARAMETERS.get(name, BaseModel).model_fields) for name in (av.get("model", "idm"), value))
-        av["parameters"] = {key: each for key, each in parameters.items() if key in after or key not in before}
+        av["parameters"] = {key: value for key, value in parameters.items() if key in after or key not in before}
     if source in ("sumo", "traci") and isinstance(world, dict) and world.get("engine") == "twin":
-        data = {**data, "world": {key: each for key, each in world.items() if key != "engine"}}
+        data = {**data, "world": {key: value for key, value in world.items() if key != "engine"}}
     return {**data, "av": av}
 
 
@@ -145,7 +145,7 @@ class AutomatedVehicle(Section):
 
     @property
     def reproducible(self) -> bool:
-        """Whether a test runs again bit for bit: the harness cannot promise it for a program outside of it."""
+        """Whether a test runs again bit for bit, which cannot be promised for a program outside of the harness."""
         return self.traci is None
 
     def identity(self) -> dict[str, Any]:

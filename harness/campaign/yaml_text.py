@@ -142,8 +142,8 @@ class StrictLoader(SafeLoader):
 def _checked_lines(root: Node) -> Lines:
     """Line of every value by its path, aliases written out.
 
-    Refused are too many values or levels, for with aliases a few lines can stand for billions of values, and keys that
-    are no text or stand there twice.
+    Too many values or levels are refused, as with aliases a few lines can stand for billions of values; so are keys
+    that are no text, or written twice.
     """
     lines: Lines = {(): root.start_mark.line + 1}
     waiting: list[tuple[tuple[str | int, ...], Node]] = [((), root)]
@@ -160,12 +160,12 @@ def _checked_lines(root: Node) -> Lines:
                 shown = key.value[:40] if isinstance(key, ScalarNode) else "made of a list or mapping"
                 found = f"a key {shown}, which is not text"
                 raise ComposerError(None, None, found, key.start_mark, "Quote the key if it is meant as text.")
-            at = (*path, key.value)
-            if at in lines:
-                found = f"the key {key.value!r} again, first written on line {lines[at]}"
-                raise ComposerError(dotted(at), None, found, key.start_mark, "Delete one of the two.")
-            lines[at] = key.start_mark.line + 1
-            waiting.append((at, value))
+            place = (*path, key.value)
+            if place in lines:
+                found = f"the key {key.value!r} again, first written on line {lines[place]}"
+                raise ComposerError(dotted(place), None, found, key.start_mark, "Delete one of the two.")
+            lines[place] = key.start_mark.line + 1
+            waiting.append((place, value))
     return lines
 
 
@@ -189,11 +189,9 @@ class _Dumper(yaml.SafeDumper):
     """Quotes every text that is not a plain word: other YAML readers see numbers, dates and truth values in many."""
 
     def ignore_aliases(self, _data: Any) -> bool:
-        """Write every value out."""
         return True
 
     def represent_text(self, text: str) -> yaml.ScalarNode:
-        """Node of a text."""
         plain = re.fullmatch(r"[A-Za-z][A-Za-z0-9_-]*", text) and text.lower() not in _MISREAD
         node: yaml.ScalarNode = self.represent_scalar("tag:yaml.org,2002:str", text, style=None if plain else '"')
         return node

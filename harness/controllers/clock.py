@@ -66,37 +66,37 @@ class Clock:
 
     @contextmanager
     def shown(self) -> Iterator[None]:
-        """In the place of the functions of ``time``, and of ``datetime``, that tell the time."""
-        own = SimpleNamespace(**vars(time))
-        now = {name: self.function(f"time.{name}", getattr(own, name)) for name in _READ}
+        """Put this clock in the place of what tells it in ``time``, ``datetime``, ``os`` and ``resource``."""
+        true = SimpleNamespace(**vars(time))
+        now = {name: self.function(f"time.{name}", getattr(true, name)) for name in _READ}
         gettime, times, usage = time.clock_gettime, os.times, resource.getrusage
         instead: dict[tuple[Any, str], Any] = {(time, name): function for name, function in now.items()}
         for name, function in now.items():
             instead[time, f"{name}_ns"] = lambda function=function: round(1e9 * function())
         for name in _SHOWN:
-            show = getattr(own, name)
+            show = getattr(true, name)
             instead[time, name] = lambda secs=None, show=show: show(now["time"]() if secs is None else secs)
         for name in _LOADS:
             instead[ExtensionFileLoader, name] = _by_true_datetime(getattr(ExtensionFileLoader, name))
         instead |= {
             (time, "clock_gettime"): lambda clock: self.function("time.clock_gettime", lambda: gettime(clock))(),
             (time, "clock_gettime_ns"): lambda clock: round(1e9 * time.clock_gettime(clock)),
-            (time, "strftime"): lambda form, at=None: own.strftime(form, time.localtime() if at is None else at),
-            (time, "asctime"): lambda at=None: own.asctime(time.localtime() if at is None else at),
+            (time, "strftime"): lambda form, at=None: true.strftime(form, time.localtime() if at is None else at),
+            (time, "asctime"): lambda at=None: true.asctime(time.localtime() if at is None else at),
             (os, "times"): lambda: os.times_result(self.function("os.times", each.__float__)() for each in times()),
             (resource, "getrusage"): lambda who: resource.struct_rusage(
                 [*(self.function("resource.getrusage", each.__float__)() for each in usage(who)[:2]), *usage(who)[2:]]
             ),
             (datetime, "datetime"): _datetime(now["time"]),
         }
-        kept = {(of, name): getattr(of, name) for of, name in instead}
+        replaced = {(place, name): getattr(place, name) for place, name in instead}
         try:
-            for (of, name), function in instead.items():
-                setattr(of, name, function)
+            for (place, name), function in instead.items():
+                setattr(place, name, function)
             yield
         finally:
-            for (of, name), function in kept.items():
-                setattr(of, name, function)
+            for (place, name), function in replaced.items():
+                setattr(place, name, function)
 
 
 def _by_true_datetime(load: Callable[..., Any]) -> Callable[..., Any]:

@@ -64,17 +64,17 @@ def own_code(
         raise
     except BaseException as error:  # of asyncio and pytest, too
         cause = f"{name}, whose module cannot be imported ({cause_of(error)})"
-        meant = did_you_mean(module_name, [file.stem for file in Path.cwd().glob("*.py")])
+        suggestion = did_you_mean(module_name, [file.stem for file in Path.cwd().glob("*.py")])
         of_file = f"Fix {module_name}." if Path(module_name).exists() else "Put it back, or name another."
         mend = of_file if is_file else "Name its file, my_av.py:Class, or install it beside the harness."
-        raise CampaignError(where, cause, "a Python module that can be imported", meant or mend) from error
-    found = getattr(module, class_name, None)
-    if not callable(found):
+        raise CampaignError(where, cause, "a Python module that can be imported", suggestion or mend) from error
+    member = getattr(module, class_name, None)
+    if not callable(member):
         own = [k for k, v in vars(module).items() if callable(v) and getattr(v, "__module__", "") == module.__name__]
         lacks = f"no class or function {class_name} in {getattr(module, '__file__', module_name)}"
         mend = did_you_mean(class_name, own) or f"It has: {', '.join(own) or 'none'}."
         raise CampaignError(where, lacks, what, mend)
-    return found  # type: ignore[no-any-return]
+    return member  # type: ignore[no-any-return]
 
 
 def source_of_own(name: str, where: str) -> str:
@@ -119,11 +119,11 @@ def build_host(
     """
     if not has_foreign_code(av):
         return None
-    told = av, seed, (guard := Guard(av.limits)), before_test
+    options = av, seed, (guard := Guard(av.limits)), before_test
     if av.fmu is not None:
         from harness.controllers.fmu import fmu_maker  # noqa: PLC0415 - an extra
 
-        return VehicleHost(*told, fmu_maker(av.fmu), n_cells, names=names)
+        return VehicleHost(*options, fmu_maker(av.fmu), n_cells, names=names)
     try:
         with guard:
             guard.limit(makes=True)
@@ -138,9 +138,9 @@ def build_host(
     finally:
         guard.require_untouched()
     if is_batch:
-        return BatchHost(*told, first, names=names)
+        return BatchHost(*options, first, names=names)
     told_at = methodcaller("told_at") if is_script(str(av.controller)) else lambda _: ""
-    return VehicleHost(*told, make, n_cells, first, told_at, names=names)
+    return VehicleHost(*options, make, n_cells, first, told_at, names=names)
 
 
 def _script(av: AutomatedVehicle, guard: Guard) -> Callable[[], Any] | None:
@@ -155,19 +155,19 @@ def _script(av: AutomatedVehicle, guard: Guard) -> Callable[[], Any] | None:
 
 
 def _maker(av: AutomatedVehicle) -> Callable[[], Any]:
-    """Makes controllers, each with parameters of its own: what one does to a list among them is nobody else's."""
+    """What makes controllers, each with a copy of the parameters: one may change a list among them for itself alone."""
     name = str(av.controller)
-    found = own_code(name)
+    target = own_code(name)
     parameters = av.parameters if isinstance(av.parameters, dict) else {}
-    make, handed = _as_class(found, name)
+    make, handed = _as_class(target, name)
     try:
         if "loaded" in handed:
-            make, parameters = _loaded_once(found, make, parameters)
-        _signature(found).bind(**handed, **parameters)
+            make, parameters = _loaded_once(target, make, parameters)
+        _signature(target).bind(**handed, **parameters)
     except TypeError as error:
-        loads = _signature(getattr(found, "load")).parameters if "loaded" in handed else {}  # noqa: B009 - has one
-        takes = [each for each in {**loads, **_signature(found).parameters} if each not in handed]
-        wrong = next((each for each in parameters if each not in takes), "")
+        loads = _signature(getattr(target, "load")).parameters if "loaded" in handed else {}  # noqa: B009 - has one
+        takes = [key for key in {**loads, **_signature(target).parameters} if key not in handed]
+        wrong = next((key for key in parameters if key not in takes), "")
         what = f"{', '.join(parameters) or 'none'}, with which {name} cannot be made ({error})"
         missing = re.findall(r"argument: '(\w+)'", str(error)) or ["NAME"]
         mend = f"Give what it needs: --set av.parameters.{missing[0]}=…; or correct its code."
@@ -179,39 +179,39 @@ def _maker(av: AutomatedVehicle) -> Callable[[], Any]:
 
 
 def _loaded_once(
-    found: Any, make: Callable[..., Any], parameters: dict[str, Any]
+    target: Any, make: Callable[..., Any], parameters: dict[str, Any]
 ) -> tuple[Callable[..., Any], dict[str, Any]]:
-    """What makes controllers, each handed the one object that ``load`` returns; and the parameters left for them."""
-    own, its = _signature(found).parameters, _signature(found.load).parameters
-    given = deepcopy({key: value for key, value in parameters.items() if key in its})
-    _signature(found.load).bind(**given)
-    load = cache(partial(found.load, **given))
-    left = {key: value for key, value in parameters.items() if key in own or key not in its}
+    """What makes controllers, all handed the one object that ``load`` returns; and the parameters left for them."""
+    own, of_load = _signature(target).parameters, _signature(target.load).parameters
+    loading = deepcopy({key: value for key, value in parameters.items() if key in of_load})
+    _signature(target.load).bind(**loading)
+    load = cache(partial(target.load, **loading))
+    others = {key: value for key, value in parameters.items() if key in own or key not in of_load}
     if isinstance(make, partial):  # a listener, which is made anew in every test
-        return lambda **each: StepListenerController(partial(found, loaded=load()), **each), left
-    return lambda **each: make(loaded=load(), **each), left
+        return lambda **keywords: StepListenerController(partial(target, loaded=load()), **keywords), others
+    return lambda **keywords: make(loaded=load(), **keywords), others
 
 
-def _as_class(found: Callable[..., Any], name: str) -> tuple[Callable[..., Any], dict[str, Any]]:
-    """What is called with the parameters to make a controller; and what else ``found`` is handed, by name.
+def _as_class(target: Callable[..., Any], name: str) -> tuple[Callable[..., Any], dict[str, Any]]:
+    """What makes a controller when called with the parameters; and what else ``target`` is handed, by name.
 
     Nothing is called that a campaign names but a class with a step, and a function that is itself the vehicle: its
     first argument is what the vehicle sees.
     """
-    takes = _signature(found).parameters
+    takes = _signature(target).parameters
     first = next(iter(takes.values()), None)
-    if isfunction(found) and first is not None and first.default is Parameter.empty:
-        return lambda **parameters: SimpleNamespace(step=partial(found, **parameters)), {first.name: None}
-    _require_controller(found if isinstance(found, type) else None, name)
-    handed = {"loaded": None} if "loaded" in takes and callable(getattr(found, "load", None)) else {}
-    if "traci" in takes and not _is_batch(found):
-        return partial(StepListenerController, found), {"traci": None, **handed}
-    return found, handed
+    if isfunction(target) and first is not None and first.default is Parameter.empty:
+        return lambda **parameters: SimpleNamespace(step=partial(target, **parameters)), {first.name: None}
+    _require_controller(target if isinstance(target, type) else None, name)
+    handed = {"loaded": None} if "loaded" in takes and callable(getattr(target, "load", None)) else {}
+    if "traci" in takes and not _is_batch(target):
+        return partial(StepListenerController, target), {"traci": None, **handed}
+    return target, handed
 
 
-def _signature(found: Callable[..., Any]) -> Signature:
+def _signature(target: Callable[..., Any]) -> Signature:
     try:
-        return signature(found)
+        return signature(target)
     except ValueError:  # a class in C may have none
         return signature(lambda **parameters: parameters)
 
@@ -239,15 +239,15 @@ def _made(make: Callable[[], Any], name: str, guard: Guard) -> Any:
         raise _not_made(name, wrong)
     _require_controller(controller, name)
     batch = {"step_batch": "seen", "start_batch": "cells, episodes, random"}
-    for method, given in (batch if _is_batch(controller) else {"step": "seen", "start": "episode"}).items():
+    for method, arguments in (batch if _is_batch(controller) else {"step": "seen", "start": "episode"}).items():
         if not callable(made := getattr(controller, method, None)):
             continue  # step is there, others need not be
         with suppress(ValueError):  # one in C may have no signature
             takes = signature(made)
             try:
-                takes.bind(*given.split(","))
+                takes.bind(*arguments.split(","))
             except TypeError as error:
-                found, expected = f"{name}, whose {method} takes {takes} ({error})", f"{method}(self, {given})"
+                found, expected = f"{name}, whose {method} takes {takes} ({error})", f"{method}(self, {arguments})"
                 raise CampaignError("av.controller", found, expected, f"Write def {expected}: in it.") from error
     return controller
 
@@ -263,7 +263,7 @@ def has_foreign_code(av: AutomatedVehicle) -> bool:
 
 
 def run_apart(av: AutomatedVehicle, work: Callable[..., _Answer], *arguments: Any) -> _Answer:
-    """``work(*arguments)``, which runs an AV, in a process of its own where that `has_foreign_code`.
+    """Call ``work(*arguments)``, which runs an AV, in a process of its own where that `has_foreign_code`.
 
     Raises whatever that raises, or an `AvEndedProcessError` if the controller ended the process.
     """
@@ -300,7 +300,7 @@ LONGEST_IDLE_S = 1.0
 
 
 def script_step_s(av: AutomatedVehicle) -> float:
-    """How often a TraCI script is asked (s), as it asks for when it is tried; 0 of any other controller."""
+    """The step (s) that a TraCI script asks for when it is tried; 0 for any other controller."""
     if not is_script(name := str(av.controller)):
         return 0.0
     from harness.controllers.traci_ego import asked_for  # noqa: PLC0415 - few campaigns have one
@@ -308,24 +308,24 @@ def script_step_s(av: AutomatedVehicle) -> float:
     (every, hardest, idle), bound = run_apart(av, asked_for, av), av.traci_style.decel_mps2
     file = real_path(file_and_function(name)[0]).name
     if not every:
-        told = "names no --step-length, nor does its .sumocfg: it is asked every 0.1 s, where SUMO would ask every 1 s"
-        _tell_once(f"{file} {told}")
+        note = "names no --step-length, nor does its .sumocfg: it is asked every 0.1 s, where SUMO would ask every 1 s"
+        _tell_once(f"{file} {note}")
     if (idle_s := idle * STEP_S * (every or 1)) > LONGEST_IDLE_S:
-        told = f"looks at no vehicle in the first {idle_s:.1f} s of a test, in which a car may cut in"
-        _tell_once(f"{file} {told}: a test is one run of it from its first line, so leave out steps that only wait")
+        note = f"looks at no vehicle in the first {idle_s:.1f} s of a test, in which a car may cut in"
+        _tell_once(f"{file} {note}: a test is one run of it from its first line, so leave out steps that only wait")
     if math.isinf(hardest):
-        told = "sets a speed mode in which no decel bounds its braking; tests fail beyond av.limits"
-        _tell_once(f"{file} {told}: if one should, use mode 31, and --set av.traci_style.decel_mps2=8, say")
+        note = "sets a speed mode in which no decel bounds its braking; tests fail beyond av.limits"
+        _tell_once(f"{file} {note}: if one should, use mode 31, and --set av.traci_style.decel_mps2=8, say")
     elif hardest > bound and "decel_mps2" not in av.traci_style.model_fields_set:
-        told = f"asks for harder braking than {bound:g} m/s², the decel of SUMO's default type, and gets that"
-        _tell_once(f"{file} {told}; of another type: --set av.traci_style.decel_mps2=8, say")
+        note = f"asks for harder braking than {bound:g} m/s², the decel of SUMO's default type, and gets that"
+        _tell_once(f"{file} {note}; of another type: --set av.traci_style.decel_mps2=8, say")
     return STEP_S * (every or 1)
 
 
 def _sources_of_made(av: AutomatedVehicle) -> str | None:
-    given = av.parameters.values() if isinstance(av.parameters, dict) else ()
+    parameters = av.parameters.values() if isinstance(av.parameters, dict) else ()
     # A file that it writes when it is made is not what it is made of.
-    named = {value: _hash_of(value) for value in given if isinstance(value, str)}
+    hashes = {value: _hash_of(value) for value in parameters if isinstance(value, str)}
     build_host(av, n_cells=1, seed=0)  # what it holds ends with the process
     if av.controller is None:
         return None
@@ -335,9 +335,9 @@ def _sources_of_made(av: AutomatedVehicle) -> str | None:
         name = getattr(own_code(av.controller), "__module__", "")
         file, above = getattr(sys.modules.get(name), "__file__", None) or "", name.count(".")
         above += file.endswith("__init__.py")  # which stands within the package that it is
-    files = {str(real_path(file)), *(name for name, was in named.items() if was == _hash_of(name))}
+    files = {str(real_path(file)), *(name for name, digest in hashes.items() if digest == _hash_of(name))}
     if is_users(root := str(real_path(file).parents[above])):
-        files |= {str(each) for each in files_imported(real_path(file), Path(root))}
+        files |= {str(module) for module in files_imported(real_path(file), Path(root))}
     return _hash_of_all(files)
 
 
@@ -347,6 +347,6 @@ def _hash_of_all(files: Iterable[str]) -> str | None:
 
 
 def _hash_of(file: str) -> str | None:
-    """Of what a file holds; None of what is none: a parameter may be no path, too long, or with a zero in it."""
-    there = os.path.isfile(file)  # noqa: PTH113 - to pathlib a name too long is an error
-    return hashlib.sha256(Path(file).read_bytes()).hexdigest() if there else None
+    """SHA-256 of a file; None if there is none: a parameter may be no path, or one too long, or with a zero in it."""
+    is_file = os.path.isfile(file)  # noqa: PTH113 - to pathlib a name too long is an error
+    return hashlib.sha256(Path(file).read_bytes()).hexdigest() if is_file else None

@@ -91,14 +91,14 @@ def _unpacked(file: Path) -> Path:
     """Folder with the FMU's content, in the cache, by its hash: workers share it."""
     name = f"fmu/{content_hash(file.read_bytes())}"
     with zipfile.ZipFile(file) as archive:
-        whole = (folder for folder in cache.places(name) if _is_whole(folder, archive))
-        return next(whole, None) or cache.put(name, partial(_unpack, archive))
+        sound = (folder for folder in cache.places(name) if _is_whole(folder, archive))
+        return next(sound, None) or cache.put(name, partial(_unpack, archive))
 
 
 def _is_whole(folder: Path, archive: zipfile.ZipFile) -> bool:
-    files = (each for each in archive.infolist() if not each.is_dir())
+    files = (entry for entry in archive.infolist() if not entry.is_dir())
     with suppress(OSError):
-        return all(checksum(folder / each.filename) == each.CRC for each in files)
+        return all(checksum(folder / entry.filename) == entry.CRC for entry in files)
     return False
 
 
@@ -141,7 +141,6 @@ def _reals(description: Any, causality: str) -> list[str]:
 
 
 def _by_name(fmu: FmuController, description: Any) -> dict[str, str]:
-    """The FMU's inputs, where each is named as an observation."""
     names = _reals(description, "input")
     if not names or not set(names) <= set(OBSERVATIONS):
         expected = f"inputs that are named as observations ({', '.join(OBSERVATIONS)}), or connected to them"
@@ -152,12 +151,12 @@ def _by_name(fmu: FmuController, description: Any) -> dict[str, str]:
 
 
 def _reference(where: str, name: str, description: Any, causalities: Sequence[str]) -> int:
-    variables = {variable.name: variable for variable in description.modelVariables}
-    found = variables.get(name)
-    if found is not None and found.type == "Real" and found.causality in causalities:
-        return int(found.valueReference)
+    variables = {each.name: each for each in description.modelVariables}
+    variable = variables.get(name)
+    if variable is not None and variable.type == "Real" and variable.causality in causalities:
+        return int(variable.valueReference)
     listed = ", ".join(f"{each.name} ({each.type} {each.causality})" for each in variables.values())
-    kind = "no variable of the FMU" if found is None else f"a {found.type} {found.causality}"
+    kind = "no variable of the FMU" if variable is None else f"a {variable.type} {variable.causality}"
     raise CampaignError(where, f"{name}, {kind}", f"a Real {' or '.join(causalities)}", f"The FMU has: {listed}.")
 
 
@@ -166,8 +165,8 @@ class FmuVehicleController:
 
     def __init__(self, wiring: Wiring, description: Any, folder: Path) -> None:
         self._wiring = wiring
-        known_as = {"guid": description.guid, "modelIdentifier": description.coSimulation.modelIdentifier}
-        self._instance = {**known_as, "unzipDirectory": str(folder)}
+        identity = {"guid": description.guid, "modelIdentifier": description.coSimulation.modelIdentifier}
+        self._instance = {**identity, "unzipDirectory": str(folder)}
         self._fmu: Any = None
         self._begun = False
 

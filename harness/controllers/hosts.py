@@ -45,11 +45,11 @@ HUNG_EXIT_CODES = 74, 75
 Failures = dict[int, str]
 """Cell → cause."""
 BeforeTest = Callable[[int], str | None]
-"""Is told of each episode in which controllers are about to be asked; its answer is why that must not be, if it is."""
+"""Called with each episode in which controllers are about to be asked; returns why they must not be, or None."""
 
 
 def time_limit(limits: Limits, *, makes: bool) -> tuple[float, str]:
-    """Of a constructor or of any other call: seconds, and the cause where they are over."""
+    """Seconds that a constructor, or any other call, may take, and the cause of failure where they are over."""
     key = "construction_time_s" if makes else "step_time_s"
     seconds: float = getattr(limits, key)
     return seconds, f"no answer within {seconds:g} s (av.limits.{key})"
@@ -70,18 +70,18 @@ LONGEST_CAUSE = 240
 
 
 def cause_of(error: BaseException) -> str:
-    """One line for the record, which is UTF-8: the text is the user's, and so is the code that makes it.
+    """What an error says, in one line of UTF-8 for the record, with the place in the user's code.
 
-    With it comes the place in the user's code, and the name that was meant where it asks for one that is not there.
+    Where it asks for a name that is not there, a similar one is suggested. Making the text runs the user's code.
     """
     try:
         text = f"{type(error).__name__}: {error}".rstrip(": ")
         origin = error.name if isinstance(error, ImportError) else type(error).__module__
         if str(origin).partition(".")[0] in ("traci", "libsumo"):  # not what stands for it here
             text = f"{text.rstrip('.')}. Use the traci that is handed in (docs/controllers.md), not the module"
-        asked = type(error.obj) if isinstance(error, AttributeError) else object
-        if isinstance(error, AttributeError) and str(asked.__module__).startswith("harness."):
-            text += f". {did_you_mean(error.name, [name for name in dir(asked) if name[0] != '_'])}".rstrip(". ")
+        kind = type(error.obj) if isinstance(error, AttributeError) else object
+        if isinstance(error, AttributeError) and str(kind.__module__).startswith("harness."):
+            text += f". {did_you_mean(error.name, [name for name in dir(kind) if name[0] != '_'])}".rstrip(". ")
     except BaseException as again:  # noqa: BLE001 - whatever a user's code raises
         text = f"{type(error).__name__}, whose text raised {type(again).__name__}"
     line = text.encode("utf-8", "backslashreplace").decode().splitlines()[0]
@@ -92,8 +92,8 @@ def _place_of(error: BaseException) -> str:
     """`` (my_av.py:12)``: the last line of the user's code on the way to an error; empty where there is none."""
     places = [(frame.f_code.co_filename, line) for frame, line in walk_tb(error.__traceback__)]
     theirs = [place for place in places if not place[0].startswith((*NOT_THE_USERS, "<"))]
-    own = [place for place in theirs if place[0].endswith(".py") and "site-packages" not in place[0]] or theirs
-    return f" ({Path(own[-1][0]).name}:{own[-1][1]})" if own else ""
+    own_files = [place for place in theirs if place[0].endswith(".py") and "site-packages" not in place[0]] or theirs
+    return f" ({Path(own_files[-1][0]).name}:{own_files[-1][1]})" if own_files else ""
 
 
 class StepTimeoutError(BaseException):
@@ -199,8 +199,8 @@ class Guard:
         An array of one element, as policies give it, is that.
         """
         if not isinstance(answer, float) and hasattr(answer, "__array__") and not np.ma.is_masked(answer):
-            found = np.asarray(answer)
-            answer = found.item() if found.size == 1 and found.dtype.kind in "iufO" else answer
+            array = np.asarray(answer)
+            answer = array.item() if array.size == 1 and array.dtype.kind in "iufO" else answer
         if not isinstance(answer, int | float | np.floating) or isinstance(answer, bool):
             what = "None (is a return missing?)" if answer is None else type(answer).__name__
             return math.nan, f"returned {what}, expected an acceleration in m/s2 as a number"
@@ -212,7 +212,7 @@ class Guard:
         return value, None
 
     def not_judged(self, answer: Any) -> tuple[float, None]:
-        """An answer of the warm-up as a number, 0 if it is none: it is only told whether it brakes."""
+        """An answer of the warm-up as a number, 0 if it is none; it serves only to say whether the AV brakes."""
         try:
             value = self.acceleration(answer)[0]
         except OverflowError:
@@ -244,7 +244,7 @@ def optional(name: str, *arguments: Any) -> Callable[[Any], None]:
 
 @dataclass
 class Host:
-    """What both hosts are told; ``names`` are those of the vehicles that controllers see as LV and BV."""
+    """What both hosts have; ``names`` are those of the vehicles that controllers see as LV and BV."""
 
     av: AutomatedVehicle
     seed: int
@@ -262,7 +262,7 @@ class Host:
 class VehicleHost(Host):
     """One controller object per cell, made by ``make``; the ``first``, if there is one already, is that of cell 0.
 
-    ``told_at`` says of one where its user asks for what it answers.
+    ``told_at`` gives the place in the user's code where a controller's last answer comes from.
     """
 
     make: Callable[[], VehicleController]
@@ -294,8 +294,8 @@ class VehicleHost(Host):
     def act(self, observation: BatchObservation, *, warms_up: bool = False) -> tuple[FloatArray, Failures]:
         """Accelerations (m/s²), shape (n,), and the cells whose controller failed (their value is not used).
 
-        One that ``warms_up`` is shown what was: what it answers is neither used nor judged, and 0 if it is no number;
-        what it raises counts.
+        One that ``warms_up`` is shown the past: its answer is neither used nor judged, and 0 if it is no number; an
+        error that it raises counts.
         """
         answer, failures = np.zeros(observation.cell.size), dict[int, str]()
         call, check = self.guard.call, self.guard.not_judged if warms_up else self.guard.acceleration
@@ -334,20 +334,20 @@ def _numbers(n: int, answer: Any) -> tuple[FloatArray | None, str | None]:
 
     That of a policy may be (n, 1).
     """
-    found = np.ma.array(answer, object).filled(np.nan) if np.ma.is_masked(answer) else np.array(answer)
-    found = found[:, 0] if found.shape == (n, 1) else found
-    if found.shape != (n,):
-        what = "None (is a return missing?)" if answer is None else f"{type(answer).__name__} of shape {found.shape}"
+    array = np.ma.array(answer, object).filled(np.nan) if np.ma.is_masked(answer) else np.array(answer)
+    array = array[:, 0] if array.shape == (n, 1) else array
+    if array.shape != (n,):
+        what = "None (is a return missing?)" if answer is None else f"{type(answer).__name__} of shape {array.shape}"
         return None, f"returned {what}, expected ({n},)"
-    are_no_numbers = found.dtype == object and any(isinstance(each, str | bytes | np.timedelta64) for each in found)
-    if found.dtype.kind not in "iufO" or are_no_numbers:
-        return None, f"returned an array of {found.dtype}, expected accelerations in m/s2 as numbers"
-    return found.astype(np.float64), None
+    are_no_numbers = array.dtype == object and any(isinstance(value, str | bytes | np.timedelta64) for value in array)
+    if array.dtype.kind not in "iufO" or are_no_numbers:
+        return None, f"returned an array of {array.dtype}, expected accelerations in m/s2 as numbers"
+    return array.astype(np.float64), None
 
 
 @dataclass
 class BatchHost(Host):
-    """One controller object for all cells. A fault that cannot be laid at one cell's door fails all that were asked."""
+    """One controller object for all cells. A fault that is not one cell's alone fails all that were asked."""
 
     controller: BatchController
 
@@ -355,13 +355,14 @@ class BatchHost(Host):
         """As `VehicleHost.start`."""
         causes = [self.before_test(episode) for episode in episodes.tolist()]
         failures = {k: f"start: {cause}" for k, cause in zip(cells.tolist(), causes, strict=True) if cause is not None}
-        sound = np.array([cause is None for cause in causes])
-        cells, announced = cells[sound], announced[sound]
+        to_start = np.array([cause is None for cause in causes])
+        cells, announced = cells[to_start], announced[to_start]
         if not cells.size:
             return failures
-        told = read_only(cells), read_only(announced), [controller_random(self.seed, i) for i in announced.tolist()]
+        random = [controller_random(self.seed, i) for i in announced.tolist()]
+        begin = optional("start_batch", read_only(cells), read_only(announced), random)
         with self.guard:
-            _, wrong = self.guard.call(optional("start_batch", *told), self.controller)
+            _, wrong = self.guard.call(begin, self.controller)
         return failures if wrong is None else failures | dict.fromkeys(cells.tolist(), f"start_batch: {wrong}")
 
     def act(self, observation: BatchObservation, *, warms_up: bool = False) -> tuple[FloatArray, Failures]:

@@ -33,22 +33,22 @@ denormals are zero, masked exceptions.
 
 
 class FloatingPointModes:
-    """Those of this thread when it is made; looking at them again takes half a microsecond."""
+    """The modes of this thread when it is made; looking at them again takes half a microsecond."""
 
     def __init__(self) -> None:
-        self._kept, now = (ctypes.create_string_buffer(64) for _ in range(2))
-        kept, self._words = (memoryview(buffer).cast("B").cast("I") for buffer in (self._kept, now))
+        self._kept, current = (ctypes.create_string_buffer(64) for _ in range(2))
+        saved, self._words = (memoryview(buffer).cast("B").cast("I") for buffer in (self._kept, current))
         self._look: Callable[..., object] = lambda: None
         self._write: Callable[..., object] = lambda _: None
         if platform.machine() in ("x86_64", "aarch64"):
             libm = ctypes.CDLL("libm.so.6")
             libm.fegetenv(self._kept)
-            libm.fegetenv(now)
-            self._look, self._write = partial(libm.fegetenv, ctypes.byref(now)), libm.fesetenv
-        self._control, self._modes = kept[_CONTROL], kept[_MXCSR] & _MODES
+            libm.fegetenv(current)
+            self._look, self._write = partial(libm.fegetenv, ctypes.byref(current)), libm.fesetenv
+        self._control, self._modes = saved[_CONTROL], saved[_MXCSR] & _MODES
 
     def restored(self) -> bool:
-        """Whether they had been changed; they are as before."""
+        """Put the modes back; whether they had been changed."""
         self._look()
         if self._words[_CONTROL] == self._control and self._words[_MXCSR] & _MODES == self._modes:
             return False
@@ -62,19 +62,19 @@ class OtherModules:
     def __init__(self) -> None:
         self._loaded = dict(sys.modules)
         watched = [name for name in self._loaded if name in WATCHED or name.partition(".")[0] == OURS[0]]
-        held: dict[str, Any] = {name: self._loaded[name] for name in watched}
-        types = [each for module in held.values() for each in vars(module).values() if isinstance(each, type)]
-        held |= {f"{each.__module__}.{each.__qualname__}": each for each in types if each.__module__[:8] == "harness."}
-        self._kept = {name: (place, _functions_and_numbers(vars(place))) for name, place in held.items()}
+        places: dict[str, Any] = {name: self._loaded[name] for name in watched}
+        types = [cls for module in places.values() for cls in vars(module).values() if isinstance(cls, type)]
+        places |= {f"{cls.__module__}.{cls.__qualname__}": cls for cls in types if cls.__module__[:8] == "harness."}
+        self._kept = {name: (place, _functions_and_numbers(vars(place))) for name, place in places.items()}
 
     def restored(self) -> list[str]:
-        """Names, as ``math`` or ``math.sqrt``, that had been replaced or deleted; they are as before."""
+        """Put all back; names, as ``math`` or ``math.sqrt``, that had been replaced or deleted."""
         gone = {name: module for name, module in self._loaded.items() if sys.modules.get(name) is not module}
         changed = [name for name in gone if name in WATCHED or name.partition(".")[0] in OURS]
         sys.modules |= {name: module for name, module in gone.items() if name in changed or name not in sys.modules}
-        for name, (place, kept) in self._kept.items():
-            for key in [key for key, value in kept.items() if vars(place).get(key, self) is not value]:
-                setattr(place, key, kept[key])
+        for name, (place, content) in self._kept.items():
+            for key in [key for key, value in content.items() if vars(place).get(key, self) is not value]:
+                setattr(place, key, content[key])
                 changed.append(f"{name}.{key}")
         return changed
 
@@ -90,5 +90,5 @@ def closed_to_files() -> str:
     return ""
 
 
-def _functions_and_numbers(held: dict[str, Any]) -> dict[str, Any]:
-    return {key: value for key, value in held.items() if key[:2] != "__" and (callable(value) or type(value) is float)}
+def _functions_and_numbers(names: dict[str, Any]) -> dict[str, Any]:
+    return {key: value for key, value in names.items() if key[:2] != "__" and (callable(value) or type(value) is float)}

@@ -46,8 +46,8 @@ def script_maker(av: AutomatedVehicle, guard: Guard) -> Callable[[], ScriptContr
     os.environ.setdefault("SUMO_HOME", sumo_data.__path__[0])  # as libsumo does: scripts look for it
     if (ego := style.ego) is None:
         with guard:
-            answer, late = guard.call(_found, script, makes=True)
-        ego, wrong = answer[:2] if answer else (None, f"{FAILS}: {late}")
+            answer, cause = guard.call(_found, script, makes=True)
+        ego, wrong = answer[:2] if answer else (None, f"{FAILS}: {cause}")
     else:
         wrong = f"calls its vehicle {ego}, as one of the others is called" if ego in OTHERS else ""
     if wrong or ego is None:
@@ -79,19 +79,19 @@ def script_maker(av: AutomatedVehicle, guard: Guard) -> Callable[[], ScriptContr
 
 
 def _lacking(name: str) -> Iterator[str]:
-    """What a script calls of ``traci`` that there is not, or is refused; with its lines."""
-    there = ScriptTraci(VehicleDomain(SPEED_MPS, VEH_ID))
+    """Calls of ``traci`` in a script that are not there, or refused; with their lines."""
+    facade = ScriptTraci(VehicleDomain(SPEED_MPS, VEH_ID))
     tree = ast.parse(Path(file_and_function(name)[0]).read_bytes())
-    for each in (node for node in ast.walk(tree) if isinstance(node, ast.Attribute)):
-        module, *path = ast.unparse(each).split(".")
+    for node in (each for each in ast.walk(tree) if isinstance(each, ast.Attribute)):
+        module, *path = ast.unparse(node).split(".")
         if module in TRACI_MODULES and len(path) == 2:
-            found = getattr(getattr(there, path[0], None), path[1], None)
-            if found is None or getattr(found, "__name__", "") == "refused":
-                yield f"{'.'.join(path)} (line {each.lineno})"
+            function = getattr(getattr(facade, path[0], None), path[1], None)
+            if function is None or getattr(function, "__name__", "") == "refused":
+                yield f"{'.'.join(path)} (line {node.lineno})"
 
 
 class _AnyName(str):
-    """The AV's name as long as nobody knows it: whatever a script holds it against, which is ``asked``."""
+    """The AV's name as long as it is not known: equal to any name that a script compares it with (``asked``)."""
 
     def __init__(self, _name: str) -> None:
         self.asked = dict[str, None]()
@@ -193,9 +193,9 @@ def _commanded(script: TraciScript, ego: str) -> tuple[_Tried, str]:
 
 
 def asked_for(av: AutomatedVehicle) -> tuple[int, float, int]:
-    """Of how many of the harness's steps one of a script's is, as it asks for before its first; 0 where it does not.
+    """Steps of the harness in one of a script's, as it asks for before its first; 0 where it does not ask.
 
-    And of `_Tried` its hardest braking and idle steps.
+    Then its hardest braking and idle steps, see `_Tried`.
     """
     script, ego = TraciScript(str(av.controller), dict(av.parameters)), av.traci_style.ego
     tried = _Tried(ego or _AnyName(VEH_ID))
@@ -203,11 +203,11 @@ def asked_for(av: AutomatedVehicle) -> tuple[int, float, int]:
     with (guard := Guard(av.limits)):
         guard.call(_drive, controller, 1, makes=True)
         if ego is None:
-            found, _ = guard.call(_found, script, makes=True)
-            tried = found[-1] if found else tried
+            answer, _ = guard.call(_found, script, makes=True)
+            tried = answer[-1] if answer else tried
         else:
-            found, _ = guard.call(_commanded, script, ego, makes=True)
-            tried = found[0] if found else tried
+            answer, _ = guard.call(_commanded, script, ego, makes=True)
+            tried = answer[0] if answer else tried
     return controller.traci.every, tried.hardest, tried.idle
 
 

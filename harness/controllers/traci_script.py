@@ -147,12 +147,12 @@ class ScriptTraci(Traci):
             raise GreenletExit  # the next of a script that runs several: a test is one
         if self.simulation.n_steps:
             raise RefusedError("traci.start is refused after a step: each test is one run of the script.")
-        if isinstance(cmd, list | tuple) and (found := _step_length([*map(str, cmd)])) is not None:
-            (asked, where), self.every = found, 0
+        if isinstance(cmd, list | tuple) and (step_length := _step_length([*map(str, cmd)])) is not None:
+            (value, where), self.every = step_length, 0
             with suppress(ValueError, OverflowError):  # hours and minutes, nan, infinity
-                self.every = round(float(asked) / STEP_S)
-            if self.every < 1 or abs(self.every * STEP_S - float(asked)) > _ROUNDING:
-                raise RefusedError(f"{where} {asked} is refused: steps here are 0.1 s; ask for a multiple of it.")
+                self.every = round(float(value) / STEP_S)
+            if self.every < 1 or abs(self.every * STEP_S - float(value)) > _ROUNDING:
+                raise RefusedError(f"{where} {value} is refused: steps here are 0.1 s; ask for a multiple of it.")
             self.vehicle.step_s = self.simulation.step_s = self.every * STEP_S
         return _VERSION
 
@@ -229,15 +229,15 @@ class ScriptTraci(Traci):
 
 
 def _step_length(options: Sequence[str]) -> tuple[str, str] | None:
-    """What SUMO's options say (s), or else the configuration file that they name, if it is there; and where."""
-    given = {**dict(pairwise(options)), **dict(each.split("=", 1) for each in options if "=" in each)}
-    if "--step-length" in given:
-        return given["--step-length"], "--step-length"
-    for name in (each.rpartition("=")[2] for each in options):
+    """The step length (s) in SUMO's options, or in the configuration file that they name; and where that is said."""
+    named = {**dict(pairwise(options)), **dict(option.split("=", 1) for option in options if "=" in option)}
+    if "--step-length" in named:
+        return named["--step-length"], "--step-length"
+    for name in (option.rpartition("=")[2] for option in options):
         if name.endswith("cfg") and Path(name).is_file():
             with suppress(ElementTree.ParseError):
-                found = ElementTree.parse(name).find(".//step-length")  # noqa: S314 - the user's own
-                return None if found is None else (found.get("value", ""), f"the step-length of {name},")
+                element = ElementTree.parse(name).find(".//step-length")  # noqa: S314 - the user's own
+                return None if element is None else (element.get("value", ""), f"the step-length of {name},")
     return None
 
 
@@ -292,7 +292,7 @@ class _Imports:
         finally:
             self._traci.importing = False
             sys.meta_path.remove(self)
-            self._own |= {each: sys.modules.pop(each) for each in self._names if each in sys.modules}
+            self._own |= {module: sys.modules.pop(module) for module in self._names if module in sys.modules}
 
     def find_spec(self, name: str, path: Any = None, target: Any = None) -> ModuleSpec | None:  # noqa: ARG002
         """As a finder of ``sys.meta_path``."""
@@ -347,7 +347,6 @@ class ScriptController:
         """Acceleration of the script's step under way (m/s²), and how many of the harness's are left of it."""
 
     def start(self, episode: EpisodeStart) -> None:
-        """See `harness.controllers.VehicleController`."""
         with suppress(ScriptError):  # the last test's
             self.close()
         self.traci = ScriptTraci(self._vehicle(episode.set_speed_mps, episode.lv_name, episode.bv_name))
@@ -355,7 +354,6 @@ class ScriptController:
         self._run = greenlet(partial(self._script.run, self.traci, lambda: int(seed())))
 
     def step(self, observation: Observation) -> float:
-        """See `harness.controllers.VehicleController`."""
         if not self._left:
             self.traci.vehicle.see(observation)
             self._turn()

@@ -84,12 +84,10 @@ class TraciStyleController:
         raise NotImplementedError(f"{type(self).__name__} needs on_step(self, traci, veh_id, time)")
 
     def start(self, episode: EpisodeStart) -> None:
-        """See `harness.controllers.VehicleController`."""
         self._traci = Traci(episode.set_speed_mps, episode.lv_name, episode.bv_name)
         self.on_start(episode.random)
 
     def step(self, observation: Observation) -> float:
-        """See `harness.controllers.VehicleController`."""
         traci = self._traci
         traci.see(observation)
         self.on_step(traci, VEH_ID, observation.time_s)

@@ -67,7 +67,7 @@ _QUESTIONS: dict[str, tuple[int, Callable[[SeenVehicle], Any]]] = {
 _VARIABLES = {number: name for name, (number, _) in _QUESTIONS.items()} | {_LEADER: "getLeader", 0x78: "getFollower"}
 """What can be subscribed to, by number."""
 _OF_THE_AV = {"getSpeedMode": "_speed_mode", "getAccel": "_accel", "getDecel": "_decel"}
-"""What has been set of it, and where that is kept."""
+"""What can be set of the AV, and which attribute keeps it."""
 _NEIGHBOURS = ("getLeftFollowers", "getRightFollowers", "getLeftLeaders", "getRightLeaders")
 """Modes of `VehicleDomain.getNeighbors`, from 0; with ``blockingOnly`` each is four more."""
 _ACCEPTED: dict[str, tuple[Callable[[Any], bool], str]] = {
@@ -98,7 +98,7 @@ class VehicleDomain(Domain):
         """What begins the plan anew: nothing for a command that is over after a step."""
         self.told_at = "", 0, DECEL
         """File and line of the last command, and the speed mode then."""
-        self._told = math.nan
+        self._commanded_mps = math.nan
         """Speed (m/s) that the AV will have if it does what it is told."""
         self._accel = self._decel = math.inf
         self._speed_mode = _ACCEL | DECEL
@@ -116,10 +116,10 @@ class VehicleDomain(Domain):
     def see(self, now: Observation) -> None:
         """Take in what is there before a step; what was refused before it is forgotten."""
         RefusedError.last = None
-        for other, there in ((self._lv, now.lv), (self._bv, now.bv)):
-            change = there.speed_mps - other.speed if self._begun else math.nan  # also where it was not seen before
+        for other, seen in ((self._lv, now.lv), (self._bv, now.bv)):
+            change = seen.speed_mps - other.speed if self._begun else math.nan  # also where it was not seen before
             other.acceleration = 0.0 if math.isnan(change) else change / self.step_s
-            other.position, other.speed, other.lane = there
+            other.position, other.speed, other.lane = seen
         for name, other in self._others.items():
             if math.isnan(other.position):
                 self._seen.pop(name, None)
@@ -135,7 +135,7 @@ class VehicleDomain(Domain):
         self._begun = True
         # In the warm-up, and as long as it is held, the AV does not do what it is told. A command of longer than a step
         # waits for it: else it would ask, at the hand-over, for speeds that it should have reached by then.
-        if self._command is not None and abs(now.speed_mps - self._told) > _ROUNDING:
+        if self._command is not None and abs(now.speed_mps - self._commanded_mps) > _ROUNDING:
             self._plan = self._command()
 
     def leave(self) -> None:
@@ -150,7 +150,7 @@ class VehicleDomain(Domain):
             acceleration = max(acceleration, -self._decel)
         if self._speed_mode & _ACCEL:
             acceleration = min(acceleration, self._accel)
-        self._told = max(0.0, self._own.speed + acceleration * self.step_s)
+        self._commanded_mps = max(0.0, self._own.speed + acceleration * self.step_s)
         return acceleration
 
     def _of(self, vehID: str) -> SeenVehicle:
@@ -199,11 +199,11 @@ class VehicleDomain(Domain):
         around[dist] = *around.get(dist, ()), *known_variables(varIDs, _VARIABLES, "vehicles")
 
     def getContextSubscriptionResults(self, objectID: str) -> dict[str, dict[int, Any]]:
-        here, found = self.getPosition(objectID), dict[str, dict[int, Any]]()
+        centre, results = self.getPosition(objectID), dict[str, dict[int, Any]]()
         for dist, variables in self._around.get(objectID, {}).items():
-            for name in (name for name in self._seen if math.dist(here, self.getPosition(name)) <= dist):
-                found.setdefault(name, {}).update(self._values(name, variables))
-        return found
+            for name in (name for name in self._seen if math.dist(centre, self.getPosition(name)) <= dist):
+                results.setdefault(name, {}).update(self._values(name, variables))
+        return results
 
     def getLeader(self, vehID: str, dist: float = 100.0) -> tuple[str, float] | None:  # noqa: ARG002 - TraCI's signature
         """Vehicle ahead on the lane and the gap to it (m, less the minGap of zero), however far away.
@@ -221,22 +221,22 @@ class VehicleDomain(Domain):
         if mode & 4:
             raise RefusedError("blockingOnly is refused: SUMO's lane change model, which says who blocks, is not here.")
         lane = self._of(vehID).lane + (-1 if mode & 1 else 1)
-        found = self._nearest(vehID, 1.0 if mode & 2 else -1.0, lane)
-        return () if found is None else (found,)
+        neighbour = self._nearest(vehID, 1.0 if mode & 2 else -1.0, lane)
+        return () if neighbour is None else (neighbour,)
 
     def _nearest(self, vehID: str, direction: float, lane: int | None = None) -> tuple[str, float] | None:
         own = self._of(vehID)
         here, lane = own.position, own.lane if lane is None else lane
-        found: tuple[str, float] | None = None
+        nearest: tuple[str, float] | None = None
         for name, other in self._seen.items():
             there = other.position
             if name == vehID or other.lane != lane or direction * (there - here) < 0.0:
                 continue
             # Operation by operation as the observed gap: bit-equal to what other controllers see.
             gap = (there - VEHICLE_LENGTH_M - here) if direction > 0.0 else (here - VEHICLE_LENGTH_M - there)
-            if found is None or gap < found[1]:
-                found = name, gap
-        return found
+            if nearest is None or gap < nearest[1]:
+                nearest = name, gap
+        return nearest
 
     # -- commands --
 
@@ -263,7 +263,6 @@ class VehicleDomain(Domain):
         self._command = command if duration > self.step_s + _ROUNDING else None
 
     def _hold(self, speed: float) -> Iterator[float]:
-        """Until further notice."""
         while True:
             yield (speed - self._own.speed) / self.step_s
 
@@ -305,9 +304,9 @@ class VehicleDomain(Domain):
             raise RefusedError(f"vehicle.{name}('{vehID}') is refused: {why}. Commands are for '{self._ego}' only.")
 
 
-def known_variables(asked: Sequence[int] | None, known: Mapping[int, str], what: str) -> tuple[int, ...]:
+def known_variables(numbers: Sequence[int] | None, known: Mapping[int, str], what: str) -> tuple[int, ...]:
     """Variables to subscribe to, by default road and position; refused where one is not among the ``known``."""
-    wanted = _ROAD_AND_POSITION if asked is None else tuple(asked)
+    wanted = _ROAD_AND_POSITION if numbers is None else tuple(numbers)
     if unknown := [hex(number) for number in wanted if number not in known]:
         raise RefusedError(f"Variable {unknown[0]} of {what} is not known here: it has {', '.join(map(hex, known))}.")
     return wanted

@@ -83,6 +83,11 @@ class Estimate:
         return math.inf if self.cautions else self.rhw
 
     @property
+    def upper_limit(self) -> float:
+        """The limit above: the interval's or, without a crash, the one-sided one."""
+        return self.ci_high if self.n_crashes else self.upper_bound
+
+    @property
     def is_wide(self) -> bool:
         """Whether the upper end of an interval from shells says more than the rate: without a crash, or with few."""
         return "shells" in self.details and not self.cautions and self.rhw > WIDE_RHW

@@ -195,7 +195,6 @@ class StratumFit(NamedTuple):
 
 
 def _ratio(before: float, after: float) -> float | None:
-    """A gain, None where nothing varies before or after."""
     return before / after if before > 0.0 and after > 0.0 else None
 
 

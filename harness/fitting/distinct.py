@@ -16,7 +16,7 @@ ONE_OF = 8
 SPEED_MPS, GAP_M, LENGTH_M = 0.25, 1.0, 0.25
 """Cells of a motion, wide enough for values rounded to 0.1 [assumed]."""
 MOMENTS, APART_S = 4, 2
-"""At which a motion is looked at."""
+"""Number of moments at which a motion is looked at, and the time between them."""
 
 
 class Fingerprint(NamedTuple):
@@ -33,20 +33,20 @@ class Fingerprint(NamedTuple):
 
 
 def fingerprint(track: Recording) -> Fingerprint:
-    """That of one recording, whatever clock, order and identifiers there are."""
-    of_row = _hashes(track.s / 1e-3, track.v / 1e-3, track.length / 1e-2)
+    """Fingerprint of one recording, whatever its clock, order of rows and identifiers."""
+    row_hashes = _hashes(track.s / 1e-3, track.v / 1e-3, track.length / 1e-2)
     order = np.lexsort((track.s, track.lane, track.road, track.frame))
     way_m = np.full(track.v.size, -GAP_M)
-    same = np.all([np.diff(of[order]) == 0 for of in (track.frame, track.road, track.lane)], axis=0)
+    same = np.all([np.diff(column[order]) == 0 for column in (track.frame, track.road, track.lane)], axis=0)
     way_m[order[:-1][same]] = np.diff(track.s[order])[same]
     apart = round(APART_S * track.rate_hz)
     n = max(track.v.size - (MOMENTS - 1) * apart, 0)
-    speeds, ways = ([of[i * apart :][:n] for i in range(MOMENTS)] for of in (track.v / SPEED_MPS, way_m / GAP_M))
+    speeds, ways = ([x[i * apart :][:n] for i in range(MOMENTS)] for x in (track.v / SPEED_MPS, way_m / GAP_M))
     changes = np.ptp(np.rint(speeds), axis=0) > 0
     changes &= track.piece[:n] == track.piece[track.v.size - n :]
     motions = _hashes(*speeds, *ways, track.length[:n] / LENGTH_M)[changes]
-    kept = of_row % ONE_OF == 0
-    rows, of_rows = _recurring(of_row[kept], track.piece[kept])
+    sampled = row_hashes % ONE_OF == 0
+    rows, of_rows = _recurring(row_hashes[sampled], track.piece[sampled])
     motions, of_motions = _recurring(motions, track.piece[:n][changes])
     return Fingerprint(track.place, rows, motions, {"rows": of_rows, "motions": of_motions})
 
@@ -71,20 +71,20 @@ KINDS = (
 )
 
 
-def require_distinct(found: Sequence[Fingerprint]) -> None:
+def require_distinct(fingerprints: Sequence[Fingerprint]) -> None:
     """Refuse a recording that has come before, under whatever name, or a notable part of one (`TrajectoryError`)."""
     for kind, what, why, most, fewest in KINDS:
-        hashes: list[IntArray] = [getattr(each, kind) for each in found]
+        hashes: list[IntArray] = [getattr(each, kind) for each in fingerprints]
         sizes = [each.size for each in hashes]
-        marks, of = np.concatenate(hashes), np.repeat(np.arange(len(found)), sizes)
-        order = np.lexsort((of, marks))
-        marks, of = marks[order], of[order]
+        marks, owner = np.concatenate(hashes), np.repeat(np.arange(len(fingerprints)), sizes)
+        order = np.lexsort((owner, marks))
+        marks, owner = marks[order], owner[order]
         again = np.flatnonzero(marks[1:] == marks[:-1])
-        pairs, counts = np.unique(np.column_stack([of[again], of[again + 1]]), axis=0, return_counts=True)
+        pairs, counts = np.unique(np.column_stack([owner[again], owner[again + 1]]), axis=0, return_counts=True)
         for (first, second), n in zip(pairs.tolist(), counts.tolist(), strict=True):
             smaller, larger = sorted((first, second), key=sizes.__getitem__)
-            chance = found[larger].recurring[kind]
+            chance = fingerprints[larger].recurring[kind]
             if (size := sizes[smaller]) >= fewest and n / size > chance + most * (1.0 - chance):
-                words = f"{n / size:.0%} of its {what} also in {found[first].place}: {why}"
+                words = f"{n / size:.0%} of its {what} also in {fingerprints[first].place}: {why}"
                 mend = "Leave one of them out: what comes twice would count twice."
-                raise TrajectoryError(found[second].place, words, "other vehicles, or other times", mend)
+                raise TrajectoryError(fingerprints[second].place, words, "other vehicles, or other times", mend)

@@ -39,17 +39,17 @@ class FittedFiles(ShownInPython):
     @property
     def files(self) -> list[Path]:
         """All that was written; the environment's file is the first."""
-        return [file for each in self.families.values() for file in each.files]
+        return [file for fitted in self.families.values() for file in fitted.files]
 
     @property
     def told(self) -> list[str]:
-        """What there is to say of it, line by line."""
-        return [line for each in self.families.values() for line in each.told]
+        """What a terminal shows of it, line by line."""
+        return [line for fitted in self.families.values() for line in fitted.told]
 
     @property
     def facts(self) -> dict[str, Any]:
         """What was observed, for JSON."""
-        return {key: value for each in self.families.values() for key, value in each.facts.items()}
+        return {key: value for fitted in self.families.values() for key, value in fitted.facts.items()}
 
 
 @checked("harness.fit")
@@ -90,27 +90,27 @@ def fit_files(
     """
     progress, out = progress or Progress(), Path(out)
     paths = [Path(file) for file in files]
-    read = load_mapping(mapping, mirror=mirror, leave_out=leave_out)
-    fitters: dict[str, Fitter] = {name: resolve_name(of.fitter)() for name, of in families().items() if of.fitter}
-    marks = {path: mark for each in fitters.values() for path, mark in each.marks(out).items()}
+    columns = load_mapping(mapping, mirror=mirror, leave_out=leave_out)
+    fitters: dict[str, Fitter] = {name: resolve_name(each.fitter)() for name, each in families().items() if each.fitter}
+    marks = {path: mark for fitter in fitters.values() for path, mark in fitter.marks(out).items()}
     _require_ours(out, marks, [*paths, Path(mapping or ".")], force=force)
     require_place(out.parent)
 
     progress.stage("reading trajectories", 1000)
-    done, seen = 0, []
-    for recording in recordings(paths, read):
-        seen.append(fingerprint(recording))
-        for each in fitters.values():
-            each.observe(recording)
+    done, fingerprints = 0, []
+    for recording in recordings(paths, columns):
+        fingerprints.append(fingerprint(recording))
+        for fitter in fitters.values():
+            fitter.observe(recording)
         progress.advance(round(1000 * recording.share_read) - done)
         done = round(1000 * recording.share_read)
-    require_distinct(seen)
-    asked = Asked(paths, mapping, read, out, n_replicates, seed, progress)
-    found: dict[str, Fitted] = {}
-    for name, each in reversed(fitters.items()):
-        found = {name: each.fitted(asked, found), **found}
-    write_together({path: content for of in found.values() for path, content in of.files.items()})
-    return FittedFiles(found)
+    require_distinct(fingerprints)
+    asked = Asked(paths, mapping, columns, out, n_replicates, seed, progress)
+    fitted: dict[str, Fitted] = {}
+    for name, fitter in reversed(fitters.items()):
+        fitted = {name: fitter.fitted(asked, fitted), **fitted}
+    write_together({path: content for each in fitted.values() for path, content in each.files.items()})
+    return FittedFiles(fitted)
 
 
 def _require_ours(out: Path, written: Mapping[Path, bytes], inputs: Sequence[Path], *, force: bool) -> None:
@@ -119,13 +119,10 @@ def _require_ours(out: Path, written: Mapping[Path, bytes], inputs: Sequence[Pat
         where = f"--out {out}"
         if os.path.realpath(path) in map(os.path.realpath, inputs):
             raise HarnessError(where, f"{path}, which is also an input", "another file", "Choose another name.")
-        if path.is_dir() or (not force and not _may_replace(path, mark)):
+        ours = force or (mark in path.read_bytes() if path.is_file() else not os.path.lexists(path))
+        if path.is_dir() or not ours:
             found = f"{path}, which harness fit has not written"
             raise HarnessError(where, found, "a new file, or one of a fit", "Choose another name, or give --force.")
-
-
-def _may_replace(path: Path, mark: bytes) -> bool:
-    return mark in path.read_bytes() if path.is_file() else not os.path.lexists(path)
 
 
 def environment_text(head: Sequence[str], content: Mapping[str, Any]) -> str:

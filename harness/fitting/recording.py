@@ -28,7 +28,7 @@ MEDIANS = (
     ("speed_mps", -0.5, 70.0, "Give units in a mapping (units: {s_m: ft, speed_mps: ft/s}); forward is positive."),
     ("length_m", 2.5, 10.0, "Give units in a mapping (units: {length_m: ft}); or is it the width of vehicles?"),
 )
-"""What medians lie between; in feet they do not."""
+"""Limits of medians, which hold in metres and not in feet."""
 MOST_APART_M = 7.0
 """Between the middles of lanes side by side [assumed]; in feet they are 12 apart."""
 OF_STEP = 0.05
@@ -132,8 +132,8 @@ class Recording:
     @cached_property
     def view(self) -> FloatArray:
         """First and last s of each road, (2, roads)."""
-        of_road = [self.s[self.road == each] for each in range(int(self.road.max()) + 1)]
-        return np.array([(s.min(), s.max()) for s in of_road]).T
+        positions = [self.s[self.road == road] for road in range(int(self.road.max()) + 1)]
+        return np.array([(s.min(), s.max()) for s in positions]).T
 
     @property
     def second(self) -> int:
@@ -148,8 +148,8 @@ class Recording:
     def has_lane(self, side: int) -> BoolArray:
         """Rows (n,) beside a lane in which vehicles drive in this recording."""
         lanes = self.lane - self.lane.min() + 1
-        at = self.road * (lanes.max() + 2) + lanes
-        return np.asarray(np.isin(at + side, np.unique(at)))
+        lane_of_road = self.road * (lanes.max() + 2) + lanes
+        return np.asarray(np.isin(lane_of_road + side, np.unique(lane_of_road)))
 
     def same_run(self, rows: IntArray, frames: int) -> BoolArray:
         """Whether the vehicle stays in its lane for so many frames after some rows (m,)."""
@@ -291,11 +291,11 @@ def _smoothed(lane: IntArray, piece: IntArray, second: int) -> tuple[IntArray, i
     run = _numbers((np.diff(piece) != 0) | (np.diff(lane) != 0))
     first = np.flatnonzero(np.diff(run, prepend=-1))
     frames = np.diff(first, append=lane.size)
-    at, of = lane[first], piece[first]
-    back = np.zeros(first.size, np.bool_)
-    back[1:-1] = (of[:-2] == of[2:]) & (at[:-2] == at[2:]) & (frames[1:-1] < second)
+    lanes, pieces = lane[first], piece[first]
+    came_back = np.zeros(first.size, np.bool_)
+    came_back[1:-1] = (pieces[:-2] == pieces[2:]) & (lanes[:-2] == lanes[2:]) & (frames[1:-1] < second)
     out = lane.copy()
-    for each in np.unique(of[back]):
-        part = slice(*np.searchsorted(piece, [each, each + 1]))
+    for number in np.unique(pieces[came_back]):
+        part = slice(*np.searchsorted(piece, [number, number + 1]))
         out[part] = ndimage.median_filter(lane[part], 2 * second + 1, mode="nearest")
-    return out, int(back.sum())
+    return out, int(came_back.sum())

@@ -74,32 +74,32 @@ def recordings(files: Sequence[str | Path], mapping: Mapping) -> Iterator[Record
     Raises `TrajectoryError`: a file cannot be read, or its rows cannot be trajectories in these units.
     """
     paths = [Path(file) for file in files]
-    kept = [path for path in paths if mapping.layout != "highd" or not path.stem.endswith("Meta")]
+    track_files = [path for path in paths if mapping.layout != "highd" or not path.stem.endswith("Meta")]
     where = places(paths)
-    if not kept:
+    if not track_files:
         raise TrajectoryError(where, "no file with tracks", "NN_tracks.csv", "Give highD's tracks as well.")
-    seen: dict[str, set[str]] = {"recording": set(), "class": set()}
-    for i, path in enumerate(kept):
-        table, done = _read(path, mapping), 0
+    names_seen: dict[str, set[str]] = {"recording": set(), "class": set()}
+    for i, path in enumerate(track_files):
+        table, n_read = _read(path, mapping), 0
         for name, rows in table.groupby("recording_id", sort=False):
-            done += len(rows)
-            seen["recording"].add(str(name))
+            n_read += len(rows)
+            names_seen["recording"].add(str(name))
             if name not in mapping.leave_out:
                 standard = _standard(rows.reset_index(drop=True), path, mapping)
-                seen["class"].update(standard["class"].unique() if mapping.classes else ())
-                yield recording_of(str(name), str(path), standard, (i + done / len(table)) / len(kept))
-    none = [] if seen["class"].intersection(mapping.classes) else mapping.classes
-    unknown = [name for name in mapping.leave_out if name not in seen["recording"]]
-    for kind, asked in (("recording", unknown), ("class", none)):
-        if asked:
-            found = f"no {kind} {' or '.join(asked)}; there are {', '.join(sorted(map(str, seen[kind])))}"
+                names_seen["class"].update(standard["class"].unique() if mapping.classes else ())
+                yield recording_of(str(name), str(path), standard, (i + n_read / len(table)) / len(track_files))
+    none = [] if names_seen["class"].intersection(mapping.classes) else mapping.classes
+    unknown = [name for name in mapping.leave_out if name not in names_seen["recording"]]
+    for kind, missing in (("recording", unknown), ("class", none)):
+        if missing:
+            found = f"no {kind} {' or '.join(missing)}; there are {', '.join(sorted(map(str, names_seen[kind])))}"
             raise TrajectoryError(where, found, "names that are there", "Correct the name, or leave it out.")
-    if seen["recording"].issubset(mapping.leave_out):
+    if names_seen["recording"].issubset(mapping.leave_out):
         raise TrajectoryError(where, "no recording that is not left out", "one or more", "Leave out fewer.")
 
 
 def places(files: Sequence[Path]) -> str:
-    """Some files, for messages."""
+    """Names of some files, for messages."""
     few = ", ".join(map(str, files[:3]))
     return few if len(files) <= 3 else f"{few} and {len(files) - 3} more"
 
@@ -124,9 +124,11 @@ def _reading(path: Path) -> Iterator[None]:
         if "columns, got" in first:
             mend = "Give each row as many values as the header has names. "
             mend += "Decimal commas need semicolons between columns."
-        if (at := re.match(r"In CSV column #(\d+): .*invalid value (.*)", first)) is not None:
-            where, mend = f"{path}, column {int(at[1]) + 1}", "Correct it, or delete the rows that have none."
-            raise TrajectoryError(where, at[2], "numbers, of one decimal sign (lane 0: the rightmost)", mend) from None
+        if (invalid := re.match(r"In CSV column #(\d+): .*invalid value (.*)", first)) is not None:
+            where, mend = f"{path}, column {int(invalid[1]) + 1}", "Correct it, or delete the rows that have none."
+            raise TrajectoryError(
+                where, invalid[2], "numbers, of one decimal sign (lane 0: the rightmost)", mend
+            ) from None
         raise TrajectoryError(str(path), f"a file that cannot be read ({first})", expected, mend) from None
 
 
@@ -191,27 +193,27 @@ def _text(path: Path, mapping: Mapping) -> tuple[Any, list[str], str, str, int]:
 def _columns(path: Path, names: Sequence[str], mapping: Mapping) -> dict[str, str]:
     """Name in the file of each column of the input table that it has; capital letters do not count."""
     lower = [name.lower() for name in names]
-    found: dict[str, str] = {}
+    columns: dict[str, str] = {}
     for column in (*NEEDED, *OPTIONAL):
-        wanted = mapping.columns.get(column, column)
-        if isinstance(wanted, float):
+        name_given = mapping.columns.get(column, column)
+        if isinstance(name_given, float):
             continue
-        if lower.count(wanted.lower()) > 1:
+        if lower.count(name_given.lower()) > 1:
             mend = "Rename all but one; capital letters do not count."
-            raise TrajectoryError(str(path), f"more than one column {wanted}", "one", mend)
-        if wanted.lower() in lower:
-            found[column] = names[lower.index(wanted.lower())]
+            raise TrajectoryError(str(path), f"more than one column {name_given}", "one", mend)
+        if name_given.lower() in lower:
+            columns[column] = names[lower.index(name_given.lower())]
         elif column in NEEDED or (column in mapping.columns and column != "recording_id"):
             known = {} if mapping.columns else {"xvelocity": "highd", "local_y": "ngsim"}
-            of = [f"Is it a file for --mapping {known[name]}?" for name in lower if name in known]
-            mend = of[0] if of else did_you_mean(wanted, names) or NO_COLUMN[column == "length_m"]
+            mappings = [f"Is it a file for --mapping {known[name]}?" for name in lower if name in known]
+            mend = mappings[0] if mappings else did_you_mean(name_given, names) or NO_COLUMN[column == "length_m"]
             mend = "Use the file as published." if mapping.layout == "highd" else mend  # xVelocity is no yVelocity
-            what = f"a column {wanted}" + (f" for {column}" if wanted != column else "")
+            what = f"a column {name_given}" + (f" for {column}" if name_given != column else "")
             raise TrajectoryError(str(path), f"the columns {', '.join(names)}", what, mend)
-    if mapping.classes and "class" not in found and mapping.layout != "highd":
+    if mapping.classes and "class" not in columns and mapping.layout != "highd":
         mend = "Add it, or leave out `classes` of the mapping."
         raise TrajectoryError(str(path), "no column class", "one, as the mapping names classes", mend)
-    return found
+    return columns
 
 
 def _renamed(table: Any, columns: dict[str, str], path: Path, mapping: Mapping, first: int) -> pd.DataFrame:

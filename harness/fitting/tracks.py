@@ -12,8 +12,6 @@ from harness.vocabulary import BoolArray, FloatArray, IntArray
 
 IN_VIEW_M = 100.0
 """Where so much of the road behind is in view and empty, nobody is behind."""
-
-
 V_MIN_MPS, V_MAX_MPS, R1_MAX_M = 20.0, 40.0, 115.0
 """Range of the states that laws are fitted to: that of the shipped environments."""
 
@@ -22,16 +20,16 @@ class Scene:
     """Positions of all vehicles at the moments of some rows."""
 
     def __init__(self, track: Recording, chosen: BoolArray) -> None:
-        at = np.flatnonzero(np.isin(track.frame, np.unique(track.frame[chosen])))
+        rows = np.flatnonzero(np.isin(track.frame, np.unique(track.frame[chosen])))
         lanes = track.lane - track.lane.min() + 1
         frames = track.frame - track.frame.min()
         self._track = track
         self._spot = (track.road * (frames.max() + 1) + frames) * (lanes.max() + 2) + lanes
         self._s = track.s - track.s.min()
         self._span = float(self._s.max() + 1.0)
-        place = self._spot[at] * self._span + self._s[at]
+        place = self._spot[rows] * self._span + self._s[rows]
         order = np.argsort(place, kind="stable")
-        self._place, self._at = place[order], at[order]
+        self._place, self._at = place[order], rows[order]
 
     def neighbours(self, rows: IntArray, side: int) -> tuple[IntArray, IntArray]:
         """Rows (m,) of the next vehicles ahead of and behind the centres of some, in the lane ``side``; -1 for none."""
@@ -61,8 +59,8 @@ class Scene:
         ttc_s = np.full(rows.size, np.inf)
         closing = r2dot < 0.0
         ttc_s[closing] = r2[closing] / -r2dot[closing]
-        seen = (after >= 0) | (track.s[rows] - track.view[0, track.road[rows]] >= IN_VIEW_M)
-        at_risk = behind & (r2 > 0.0) & (track.gap(ahead, rows) > 0.0) & seen
+        in_view = (after >= 0) | (track.s[rows] - track.view[0, track.road[rows]] >= IN_VIEW_M)
+        at_risk = behind & (r2 > 0.0) & (track.gap(ahead, rows) > 0.0) & in_view
         columns = {"v_mps": track.v[rows], "r1_m": r1, "r1dot_mps": track.rate(leader, rows)}
         columns |= {"r2_m": r2, "r2dot_mps": r2dot, "ttc_s": ttc_s}
         return columns | {"leads": leader >= 0, "fits": fits, "follows": follows, "behind": behind, "at_risk": at_risk}

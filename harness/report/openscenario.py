@@ -83,6 +83,5 @@ def _follows(name: str, positions: list[xosc.WorldPosition]) -> xosc.Maneuver:
 
 
 def _at(time_s: float, side: str) -> xosc.ValueTrigger:
-    """Trigger of a moment, to start or to stop."""
     when = xosc.SimulationTimeCondition(time_s, xosc.Rule.greaterOrEqual)
     return xosc.ValueTrigger(f"{side} at {time_s:.1f} s", 0.0, xosc.ConditionEdge.none, when, side)

@@ -65,9 +65,8 @@ def rows_of(campaign: Campaign, manifest: Mapping[str, Any], estimates: Estimate
     if not references and campaign.has_baseline_runs and "shells" in best.details and not best.cautions:
         yield Row("ratio", "× competent driver", "no ratio", "", "that driver never crashes here")
     if assumed is not None and (others := looking_words(assumed)) and not from_below:
-        highest = number(assumed.most * _high(best))
-        most = f"up to {number(assumed.most, 2)} times"
-        yield Row("assumed", "in other traffic", most, f"up to {highest}", f"if {others}")
+        most, highest = f"up to {number(assumed.most, 2)} times", f"up to {number(assumed.most * best.upper_limit)}"
+        yield Row("assumed", "in other traffic", most, highest, f"if {others}")
     if campaign.has_baseline_runs and best.n_crashes:
         yield from width_row(campaign, best, manifest.get("expected"))
     if estimates.severity is not None:
@@ -76,22 +75,18 @@ def rows_of(campaign: Campaign, manifest: Mapping[str, Any], estimates: Estimate
         yield within(best.details["within"])
 
 
-def _high(best: Estimate) -> float:
-    return best.ci_high if best.n_crashes else best.upper_bound
-
-
 def _rate_row(what: str, estimates: Estimates, unseen: AssumedOfRate | None, *, from_below: bool) -> Row:
     """The rate with its interval, or with one limit alone where the other end says nothing."""
     best, distance_km = estimates.best, estimates.distance_per_test_km
     sign, shown, ends = "", best.crash_rate, interval(best.ci_low, best.ci_high, beside=best.crash_rate)
     sampled = f"estimate {number(best.crash_rate)}" if best.n_crashes else "no crash seen"
     if unseen is not None:
-        sign, shown = "< ", unseen.most * _high(best)
+        sign, shown = "< ", unseen.most * best.upper_limit
         ends = f"{number(best.crash_rate)} as fitted" if best.n_crashes else sampled
     elif from_below:
         sign, shown, ends = "> ", best.ci_low, sampled
     elif not best.n_crashes or best.is_wide:
-        sign, shown, ends = "< ", _high(best), sampled
+        sign, shown, ends = "< ", best.upper_limit, sampled
     remark = "" if not distance_km else f"{sign}{number(shown * 1e6 / distance_km)} per million km"
     if unseen is not None:
         remark = f"none seen at {unseen.where}"

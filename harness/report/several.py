@@ -58,7 +58,6 @@ def hour_lines(content: Mapping[str, Any], report: Path | None = None, *, readin
 
 
 def _sum_rows(content: Mapping[str, Any], *, readings: bool) -> Iterator[Row]:
-    """Crashes per hour, and beside the competent driver."""
     hour, seen, decision = content["per_hour"], content["n_crashes"] > 0, content["decision"]
     what = f"crashes > {plain(above)} m/s" if (above := content.get("counts_above_mps")) else "crashes"
     # Where a limit was rejected after few tests the upper end says nothing.

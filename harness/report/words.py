@@ -188,7 +188,6 @@ def warnings_of(scenario: str, result: Mapping[str, Any], unit: str, but: str = 
 
 
 def _warnings(campaign: Campaign, manifest: Mapping[str, Any], estimates: Estimates) -> Iterator[str]:
-    """What changes the meaning of the rows, a line each."""
     best, assumed, traffic = estimates.best, estimates.assumed, estimates.traffic
     rates = {"rate": best.crash_rate, "ci_high": best.ci_high}
     result = {**rates, "n_episodes": best.n_episodes, "n_failed": best.details["n_failed"]}
