@@ -1,7 +1,7 @@
 """State of the K tests that run side by side, and the buffers that a shard's results are written to.
 
-Scalars of a cell are fields of one record, so that a kernel touches one cache line; what has a length is an array with
-the cell as first axis. Results are written to row ``episode − first`` of the shard: finishing order leaves no trace.
+Scalars of a cell are fields of one record, so that a kernel touches one cache line; the rest are arrays with the cell
+as first axis. Results are written to row ``episode − first`` of the shard, whatever the order in which tests end.
 """
 
 from __future__ import annotations
@@ -25,14 +25,14 @@ CELL_DTYPE = np.dtype(
         ("motion_hash", np.uint64),  # hash of the AV's motion, through the step of the onset
         ("step", _i8),  # t, in steps
         ("event_step", _i8),  # step of the event, -1 before it
-        ("planned", _i8),  # step in which it will be, if that is known before; else -1
-        ("lead", _i8),  # steps from its onset to it
+        ("planned", _i8),  # step in which the event will be, if that is known before; else -1
+        ("lead", _i8),  # steps from the onset to the event
         ("onset_step", _i8),  # -1: nobody knows of an onset yet
         ("acts_from", _i8),  # first step in which the AV may act
-        ("cruises", _i8),  # whether the AV still keeps its speed, whatever it asks for but to brake
-        ("set_speed", _f8),  # at which the AV cruises
+        ("cruises", _i8),  # whether the AV still keeps its speed, unless it asks to brake
+        ("set_speed", _f8),  # speed at which the AV cruises
         ("av_speed", _f8),  # of the AV before the step
-        ("danger", _f8),  # what a built-in AV remembers beside its acceleration
+        ("danger", _f8),  # a built-in AV's memory beside its acceleration
     ]
 )
 
@@ -45,12 +45,12 @@ EPISODE_DTYPE = np.dtype(
     + [(name, np.int16) for name in _STEPS]
     + [(name, _f8) for name in (*_AT_EVENT, *_AT_END, *_DRAWN)]
 )
-"""What becomes of a test. ``component`` is the stratum or importance function that it was drawn from, -1 for none;
-``took_over_step`` the first in which the AV did what it asked for, -1 for none, ``asked_to_speed_up`` whether it
-asked for that while it was held, ``braked_before`` whether it asked to brake at the end of its warm-up, and
+"""Result of a test. ``component`` is the stratum or importance function that it was drawn from, -1 for none;
+``took_over_step`` the first in which the AV did what it asked for, -1 for none; ``asked_to_speed_up`` whether it
+asked to speed up while its speed was held; ``braked_before`` whether it asked to brake at the end of its warm-up;
 ``fell_behind`` whether it was more than `FAR_BEHIND_S` behind the vehicle ahead when the event began."""
 FAR_BEHIND_S = 5.0
-"""Longer than who follows is behind another vehicle [assumed]."""
+"""Headway beyond which the AV no longer follows the vehicle ahead [assumed]."""
 
 
 class Cells(NamedTuple):
@@ -58,8 +58,8 @@ class Cells(NamedTuple):
 
     ``cell`` (K,) are `CELL_DTYPE` records. ``speed`` (K, V) and ``lane`` (K, V) are the commands for the coming step,
     ``lane_before`` (K, V) the lanes before it, ``acceleration`` (K,) the AV's. ``trace`` (K, steps + 1, V, 4: x, v,
-    acceleration, lane) is (K, 1, V, 4) when not kept. ``placed`` (K,) begins with the cells that have been refilled for
-    the coming step, ``ended`` and ``ended_row`` (K,) with those whose test has ended, and its row.
+    acceleration, lane) is (K, 1, V, 4) when not kept. ``placed`` (K,) begins with the cells that were refilled for the
+    coming step; ``ended`` and ``ended_row`` (K,) begin with the cells whose test has ended, and its row.
     """
 
     cell: RecordArray
@@ -85,11 +85,11 @@ def idle_cells(n_cells: int, n_vehicles: int, max_steps: int, *, keep_traces: bo
 
 
 class PrescribedEvents(NamedTuple):
-    """Which events of a pool tests prescribe, and what the error of the pool is told by.
+    """Events of a pool that tests prescribe, and what estimates of the pool's own error need.
 
     ``row`` (n,) is the row in the pool, ``cell`` (n,) the cell of the campaign's design, ``cell_mass`` (n, C) the
     path's probability of an event of each cell. Of vehicles that act before the event ``shadow`` (n,) is the baseline
-    run, and ``mass`` (n,) the probability of the event itself; else empty.
+    run, and ``mass`` (n,) the probability of the events that it stands for; else empty.
     """
 
     row: IntArray
@@ -100,15 +100,14 @@ class PrescribedEvents(NamedTuple):
 
 
 class KernelState(NamedTuple):
-    """All that the tests of a shard are run with, and written to.
+    """What the tests of a shard are run with, and written to; truth values are 0 or 1.
 
     ``first_episode`` is the campaign index of row 0. ``x``, ``v`` (K, V) are the world's positions (m) and speeds
-    (m/s). ``episode`` (n,) are the results, `EPISODE_DTYPE`. ``principal`` is the
-    place of the vehicle that the event is about, and ``ahead`` that of the one ahead of it, -1 without one;
-    ``sideways_m`` is the way from its first lateral motion to overlap. ``driver`` is (1,) for a built-in AV, else (0,).
-    ``observation`` is what a controller outside of the kernels sees, ``acts_early`` whether from the start, whatever
-    the script says. Else ``av_cruises`` says whether the AV then keeps its speed until it first asks to brake, or
-    somebody is ahead on its lane. What may be so or not is 0 or 1.
+    (m/s). ``episode`` (n,) are the results, `EPISODE_DTYPE`. ``principal`` is the place of the vehicle that the event
+    is about, ``ahead`` that of the one ahead of it, -1 without one; ``sideways_m`` is the way from its first lateral
+    motion to overlap. ``driver`` is (1,) for a built-in AV, else (0,). ``observation`` is what a controller outside of
+    the kernels sees; ``acts_early`` is whether the AV acts from the start, whatever the script says. If it does not,
+    ``av_cruises`` is whether it keeps its speed until it first asks to brake, or somebody is ahead on its lane.
     """
 
     seed: int

@@ -1,4 +1,4 @@
-"""What AVs do in the coming step, or see if a controller is to say it; and the speeds commanded."""
+"""Accelerations of built-in AVs for the coming step, what other controllers see of it, and the speeds commanded."""
 
 from __future__ import annotations
 
@@ -20,17 +20,18 @@ from harness.vocabulary import FloatArray, Int8Array, IntArray, read_only
 
 @compiled
 def drive(kernel: KernelState) -> None:
-    """Acceleration of a built-in AV wherever it meets an event; it acts from the step after the onset at most."""
+    """Set the acceleration of a built-in AV in every cell where it follows, or where an event has begun."""
     x, v, cells, driver = kernel.x, kernel.v, kernel.cells, kernel.driver
-    perceives_m, av, other = driver[0].perceives_lateral_m, x.shape[1] - 1, kernel.principal
+    av, other = x.shape[1] - 1, kernel.principal
+    perceives_m = driver[0].perceives_lateral_m
     for k in range(cells.cell.size):
         cell = cells.cell[k]
         if cell.row >= 0 and cell.acts_from == 0:
             follow(k, kernel)
         if cell.row < 0 or cell.acts_from == 0 or cell.onset_step < 0 or cell.step <= cell.onset_step:
             continue
-        first, earlier = perceived_in(perceives_m, cell.planned, cell.lead, kernel.sideways_m)
-        step = cell.step - first - reaction_steps(driver[0], kernel.seed, cell.episode)
+        perceived, earlier = perceived_in(perceives_m, cell.planned, cell.lead, kernel.sideways_m)
+        step = cell.step - perceived - reaction_steps(driver[0], kernel.seed, cell.episode)
         if step >= 0:
             memory = Memory(cells.acceleration[k], cell.danger, driver[0].used_up_steps + earlier)
             memory = react(driver[0], memory, step, v[k, av], v[k, other], gap(x[k, other], x[k, av]))
@@ -39,10 +40,10 @@ def drive(kernel: KernelState) -> None:
 
 @compiled_inline
 def follow(k: int, kernel: KernelState) -> None:
-    """Acceleration of a built-in AV that follows from the start; see `harness.vehicles.following`."""
+    """Set the acceleration of a built-in AV that follows from the start; see `harness.vehicles.following`."""
     cells, driver, script, lane = kernel.cells, kernel.driver[0], kernel.script, kernel.cells.lane_before
     cell, speed = cells.cell[k], kernel.v[k, kernel.x.shape[1] - 1]
-    late, perceived, reacts = reaction_steps(driver, kernel.seed, cell.episode), 0, NEVER
+    perceived, reacts = 0, NEVER
     lead = revealed = Ahead(speed, math.inf, 0.0)
     if cell.onset_step >= 0:
         clear, perceived = cell.planned + 1 - cell.onset_step, cell.onset_step + braking_seen_after(driver)
@@ -50,16 +51,16 @@ def follow(k: int, kernel: KernelState) -> None:
             perceived = cell.onset_step + seen_after(driver.perceives_lateral_m, script.sideways_mps[cell.row], clear)
         for other in range(kernel.x.shape[1] - 1):
             perceived = max(perceived, script.visible_from[cell.row, other])
-        reacts = perceived + late
+        reacts = perceived + reaction_steps(driver, kernel.seed, cell.episode)
     for other in range(kernel.x.shape[1] - 1):
         hidden = script.visible_from[cell.row, other] > 0
         if not is_ahead_of(k, other, lane, kernel) or (hidden and (cell.onset_step < 0 or cell.step < perceived)):
             continue
-        seen = ahead_of(k, other, kernel)
-        if hidden and seen.gap < revealed.gap:
-            revealed = seen
-        elif not hidden and seen.gap < lead.gap:
-            lead = seen
+        ahead = ahead_of(k, other, kernel)
+        if hidden and ahead.gap < revealed.gap:
+            revealed = ahead
+        elif not hidden and ahead.gap < lead.gap:
+            lead = ahead
     waits = 0 <= cell.onset_step < cell.step < reacts
     memory = Memory(cells.acceleration[k], cell.danger, 0.0)
     headway_s = headway_of(driver, script.headway_s[cell.row], script.v[cell.row, script.v.shape[1] - 1])
@@ -82,7 +83,7 @@ def ahead_of(k: int, other: int, kernel: KernelState) -> Ahead:
 
 @compiled_inline
 def held_if_cruising(k: int, asked: float, kernel: KernelState) -> float:
-    """Acceleration (m/s²) of an AV that asks for one: none while it cruises."""
+    """Acceleration (m/s²) of an AV that asks for one: 0 while it cruises."""
     cell = kernel.cells.cell[k]
     test = kernel.episode[cell.row]
     if still_cruises(cell.cruises, 0 <= cell.event_step < cell.step, asked):
@@ -95,7 +96,7 @@ def held_if_cruising(k: int, asked: float, kernel: KernelState) -> float:
 
 @compiled
 def hold_cruising(kernel: KernelState, n: int) -> None:
-    """The first ``n`` AVs that were asked do what they ask for, unless they are still to keep their speed."""
+    """Hold those of the first ``n`` AVs of the observation that still cruise; the others do what they ask for."""
     for i in range(n):
         k = kernel.observation.cell[i]
         kernel.cells.acceleration[k] = held_if_cruising(k, kernel.cells.acceleration[k], kernel)
@@ -103,7 +104,7 @@ def hold_cruising(kernel: KernelState, n: int) -> None:
 
 @compiled
 def observe(kernel: KernelState) -> int:
-    """Write what the AVs that are to act see to ``kernel.observation``; returns their number."""
+    """Write to ``kernel.observation`` what the AVs that are to act see; returns their number."""
     x, v, cells, out = kernel.x, kernel.v, kernel.cells, kernel.observation
     av, bv, lv, distance_m = x.shape[1] - 1, kernel.principal, kernel.ahead, kernel.sideways_m
     n = 0
@@ -111,7 +112,8 @@ def observe(kernel: KernelState) -> int:
         cell = cells.cell[k]
         if cell.row < 0 or cell.step < cell.acts_from:
             continue
-        leader, comes = leader_of(k, cells.lane_before, False, kernel), 0 <= cell.onset_step < cell.step
+        leader = leader_of(k, cells.lane_before, False, kernel)
+        begun = 0 <= cell.onset_step < cell.step
         on_lane = cells.lane_before[k, bv] == cells.lane_before[k, av] and is_visible(k, bv, kernel)
         out.cell[n], out.episode[n], out.time_s[n] = k, cell.announced_index, cell.step * STEP_S
         out.position_m[n], out.speed_mps[n] = x[k, av], v[k, av]
@@ -124,11 +126,11 @@ def observe(kernel: KernelState) -> int:
         out.lv_lane[n] = cells.lane_before[k, lv] if lv >= 0 else 0
         out.bv_overlaps[n], out.set_speed_mps[n] = 1 if on_lane else 0, cell.set_speed
         out.bv_lateral_m[n] = out.bv_lateral_speed_mps[n] = out.lv_lateral_m[n] = out.lv_lateral_speed_mps[n] = 0.0
-        if comes and kernel.script.sideways_mps[cell.row] > 0.0:  # the one ahead leaves
+        if begun and kernel.script.sideways_mps[cell.row] > 0.0:  # the vehicle ahead leaves the lane
             leaving = kernel.script.sideways_mps[cell.row]
             out.lv_lateral_m[n] = min(leaving * ((cell.step - cell.onset_step) * STEP_S), distance_m)
             out.lv_lateral_speed_mps[n] = leaving if cell.step <= cell.planned else 0.0
-        elif comes and distance_m > 0.0:
+        elif begun and distance_m > 0.0:
             out.bv_lateral_m[n] = lateral_position(cell.step, cell.planned, cell.lead, distance_m)
             out.bv_lateral_speed_mps[n] = 0.0 if on_lane else distance_m / (cell.lead * STEP_S)
         n += 1
@@ -168,24 +170,24 @@ def seen_of(k: int, other: int, kernel: KernelState) -> tuple[float, float]:
     return kernel.x[k, other], kernel.v[k, other]
 
 
-_WHOLE = "cell", "episode", "bv_lane", "lv_lane", "bv_overlaps"
-_REAL = [name for name in BatchObservation._fields if name not in _WHOLE]
+_INTEGERS = "cell", "episode", "bv_lane", "lv_lane", "bv_overlaps"
+_FLOATS = [name for name in BatchObservation._fields if name not in _INTEGERS]
 
 
 def empty_observation(n_cells: int) -> BatchObservation:
-    """Room for the observations of K cells: rows of one array of whole numbers and of one of floats."""
-    return _rows(np.zeros((len(_WHOLE), n_cells), np.int64), np.zeros((len(_REAL), n_cells)))
+    """Room for the observations of K cells, as rows of one array of integers and of one of floats."""
+    return _rows(np.zeros((len(_INTEGERS), n_cells), np.int64), np.zeros((len(_FLOATS), n_cells)))
 
 
 def first(observation: BatchObservation, n: int) -> BatchObservation:
     """The first ``n`` entries of every array, as copies that a controller may keep, and that nobody can write into."""
-    whole: Any = observation.cell.base
-    real: Any = observation.time_s.base
-    return _rows(read_only(whole[:, :n].copy()), read_only(real[:, :n].copy()))
+    integers: Any = observation.cell.base
+    floats: Any = observation.time_s.base
+    return _rows(read_only(integers[:, :n].copy()), read_only(floats[:, :n].copy()))
 
 
 class Past:
-    """The last states of K cells: what a controller whose AV keeps its speed until the event is shown of them.
+    """The last states of K cells, for the warm-up of a controller whose AV keeps its speed until the event.
 
     ``principal`` and ``ahead`` are the places of the vehicles that are BV and LV to it; see `KernelState`.
     """
@@ -208,25 +210,26 @@ class Past:
         """
         n_steps, step = len(self._states), np.rint(seen.time_s / STEP_S).astype(np.int64)
         ago = np.arange(n_steps, 0, -1)[:, None]
-        known = np.minimum(ago, step)
-        x, v = np.moveaxis(self._states[(self._n_noted - known) % n_steps, :, seen.cell], (2, 3), (0, 1))
-        x = x - v * ((ago - known) * STEP_S)
-        lv_x, lv_v = (x[self._ahead], v[self._ahead]) if self._ahead >= 0 else (np.full(known.shape, math.nan),) * 2
-        told = {
+        noted = np.minimum(ago, step)
+        shape = noted.shape
+        x, v = np.moveaxis(self._states[(self._n_noted - noted) % n_steps, :, seen.cell], (2, 3), (0, 1))
+        x = x - v * ((ago - noted) * STEP_S)
+        lv_x, lv_v = (x[self._ahead], v[self._ahead]) if self._ahead >= 0 else (np.full(shape, math.nan),) * 2
+        columns = {
             "time_s": (step - ago) * STEP_S, "position_m": x[-1], "speed_mps": v[-1],
-            "gap_m": np.full(known.shape, math.inf), "lead_speed_mps": np.full(known.shape, math.nan),
+            "gap_m": np.full(shape, math.inf), "lead_speed_mps": np.full(shape, math.nan),
             "bv_position_m": x[self._principal], "bv_speed_mps": v[self._principal],
             "lv_position_m": lv_x, "lv_speed_mps": lv_v,
-            "set_speed_mps": np.broadcast_to(seen.set_speed_mps, known.shape),
+            "set_speed_mps": np.broadcast_to(seen.set_speed_mps, shape),
         }  # fmt: skip
-        real = [told.get(name, np.zeros(known.shape)) for name in _REAL]
-        left = np.ones_like(seen.cell)
-        whole = read_only(np.stack((seen.cell, seen.episode, left, left, np.zeros_like(left))))
-        return [_rows(whole, rows) for rows in read_only(np.stack(real, axis=1))]
+        floats = [columns.get(name, np.zeros(shape)) for name in _FLOATS]
+        left_lane = np.ones_like(seen.cell)
+        integers = read_only(np.stack((seen.cell, seen.episode, left_lane, left_lane, np.zeros_like(left_lane))))
+        return [_rows(integers, of_step) for of_step in read_only(np.stack(floats, axis=1))]
 
 
-def _rows(whole: IntArray, real: FloatArray) -> BatchObservation:
-    return BatchObservation(**dict(zip(_WHOLE, whole, strict=True)), **dict(zip(_REAL, real, strict=True)))
+def _rows(integers: IntArray, floats: FloatArray) -> BatchObservation:
+    return BatchObservation(**dict(zip(_INTEGERS, integers, strict=True)), **dict(zip(_FLOATS, floats, strict=True)))
 
 
 @compiled

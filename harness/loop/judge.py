@@ -1,4 +1,4 @@
-"""After a step: which tests are over and how (crash, impact speed, ...), and what stays of them."""
+"""After a step: which tests are over, how each ended (crash, impact speed, ...), and what is recorded of it."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ from harness.vocabulary import (
 )
 
 PASSED_M, PASSED_UNDER_CONTROL_M = 0.0, -10.0
-"""Gap to the principal vehicle at which the AV has passed it: at once if it holds its speed, with a margin if its
-controller acts."""
+"""Gaps to the principal vehicle at which the AV has passed it: for one that holds its speed, and, with a margin, for
+one whose controller acts."""
 
 
 @compiled
@@ -42,13 +42,14 @@ def judge(kernel: KernelState, contact: BoolArray) -> int:
         if cell.row < 0:
             continue
         cell.step += 1
-        test, before, cell.av_speed = kernel.episode[cell.row], cell.av_speed, kernel.v[k, av]
+        test = kernel.episode[cell.row]
+        speed_before, cell.av_speed = cell.av_speed, kernel.v[k, av]
         if 0 <= cell.onset_step < cell.step:
-            test.hardest_braking_mps2 = max(test.hardest_braking_mps2, (before - cell.av_speed) / STEP_S)
+            test.hardest_braking_mps2 = max(test.hardest_braking_mps2, (speed_before - cell.av_speed) / STEP_S)
         if is_ahead(k, kernel):
-            left, rate = gap_and_rate(k, kernel)
-            if rate < 0.0 and left >= 0.0:
-                test.min_ttc_s = min(test.min_ttc_s, left / -rate)
+            gap_m, rate = gap_and_rate(k, kernel)
+            if rate < 0.0 and gap_m >= 0.0:
+                test.min_ttc_s = min(test.min_ttc_s, gap_m / -rate)
         outcome = outcome_of(k, kernel)
         if contact[k] != (outcome in (CRASH, CONTACT)):
             return -1 - k
@@ -69,7 +70,7 @@ def is_ahead(k: int, kernel: KernelState) -> bool:
 
 @compiled_inline
 def touched_by(k: int, vehicle: int, kernel: KernelState) -> int:
-    """The first vehicle before it in the order of vehicles that touches a vehicle; -1 for none.
+    """Lowest place of another vehicle, below ``vehicle``, that touches it; -1 for none.
 
     Two touch that overlap on one lane, or on the one that they shared when the step began.
     """
@@ -90,11 +91,12 @@ def outcome_of(k: int, kernel: KernelState) -> int:
             return CONTACT
     if touched_by(k, av, kernel) >= 0:
         return CRASH
-    left = gap(kernel.x[k, kernel.principal], kernel.x[k, av])
+    gap_m = gap(kernel.x[k, kernel.principal], kernel.x[k, av])
+    passed_m = PASSED_UNDER_CONTROL_M if kernel.acts_early else PASSED_M
     if is_ahead(k, kernel):
-        if left < CONTACT_M:
+        if gap_m < CONTACT_M:
             return PASSED
-    elif left <= (PASSED_UNDER_CONTROL_M if kernel.acts_early else PASSED_M) and not (0 <= cell.onset_step < cell.step):
+    elif gap_m <= passed_m and not (0 <= cell.onset_step < cell.step):
         return PASSED
     if cell.step >= kernel.script.n_steps[cell.row] or both_stand(k, kernel):
         return TIMEOUT
@@ -115,19 +117,20 @@ def both_stand(k: int, kernel: KernelState) -> bool:
 def time_to_collision(k: int, kernel: KernelState) -> float:
     """Time (s) until an AV that closes in hits the vehicle ahead, each at its present acceleration and speed; else inf.
 
-    Of d = w t + a t²/2 it is the smaller root, d being the gap, w the closing speed and a the AV's acceleration.
+    It is the smaller root t of d = w t + a t²/2, d being the gap, w the closing speed and a the AV's acceleration.
     """
-    v, leader, av = kernel.v, leader_of(k, kernel.cells.lane, True, kernel), kernel.x.shape[1] - 1
+    v, av = kernel.v, kernel.x.shape[1] - 1
+    leader = leader_of(k, kernel.cells.lane, True, kernel)
     if leader < 0 or v[k, av] <= v[k, leader]:
         return math.inf
-    closing, left = v[k, av] - v[k, leader], gap(kernel.x[k, leader], kernel.x[k, av])
-    square = closing * closing + 2.0 * kernel.cells.acceleration[k] * left
-    return 2.0 * left / (closing + math.sqrt(square)) if square >= 0.0 else math.inf
+    closing, gap_m = v[k, av] - v[k, leader], gap(kernel.x[k, leader], kernel.x[k, av])
+    square = closing * closing + 2.0 * kernel.cells.acceleration[k] * gap_m
+    return 2.0 * gap_m / (closing + math.sqrt(square)) if square >= 0.0 else math.inf
 
 
 @compiled_inline
 def left_baseline(k: int, outcome: int, kernel: KernelState) -> bool:
-    """Whether the AV has done something else than in its baseline run: what follows would count with a wrong weight."""
+    """Whether the AV has not moved as in its baseline run, which its test's weight is made for."""
     cell, av = kernel.cells.cell[k], kernel.x.shape[1] - 1
     if 0 <= cell.onset_step < cell.step - 1:
         return False
@@ -135,7 +138,7 @@ def left_baseline(k: int, outcome: int, kernel: KernelState) -> bool:
     cell.motion_hash = mixed(mixed(cell.motion_hash, x[k, av]), v[k, av])
     if 0 <= cell.onset_step < cell.step:
         return bool(cell.motion_hash != kernel.script.motion_hash[cell.row])
-    return outcome != RUNNING  # before the onset that its baseline run has come to
+    return outcome != RUNNING  # it ends before the onset, which its baseline run has reached
 
 
 @compiled
@@ -168,7 +171,7 @@ def end_test(k: int, outcome: int, n: int, kernel: KernelState) -> None:
     cell.row = -1
 
 
-# A running hash of the AV's motion: whether a test's vehicle has done what it did in its baseline run, to the last bit.
+# A running hash of the AV's motion, by which a test's is compared with that of its baseline run, to the last bit.
 # Each word is mixed in by a multiplication, which carries low bits up, and a shift, which brings high bits down: the
 # finalizer of SplitMix64 (Steele, Lea and Flood, OOPSLA 2014, doi:10.1145/2660193.2660195), one round per word. Two
 # motions that differ agree by chance with a probability of about 2^-64.

@@ -27,16 +27,16 @@ STRAYED = (
 """Cause of a test that failed because its weight would have been wrong."""
 
 BRAKES_MPS2 = -0.1
-"""Who asks for less while nobody is ahead slows down of its own accord [assumed]: rounding asks for less than that."""
+"""Acceleration below which an AV with nobody ahead brakes of its own accord; rounding is far smaller [assumed]."""
 
 
 class Scenario(NamedTuple):
-    """What tests of a campaign have in common.
+    """What the tests of a campaign have in common.
 
     ``vehicles`` are the names of the vehicles of a cell, the AV last; ``principal`` is the place of the one that events
-    are about, ``ahead`` of the one ahead of it (-1: none). ``max_steps`` is the longest test, ``sideways_m`` the way
-    from a first lateral motion to overlap, and ``shows`` whether events can be seen before they happen. ``driver`` (1,)
-    is a built-in AV, else (0,). ``columns`` are the facts of tests that records keep.
+    are about, ``ahead`` of the one ahead of it (-1: none). ``max_steps`` is the length of the longest test,
+    ``sideways_m`` the way from a first lateral motion to overlap, ``shows`` whether events can be seen before they
+    happen. ``driver`` is (1,) for a built-in AV, else (0,). ``columns`` are the facts of tests that records keep.
     """
 
     seed: int
@@ -56,7 +56,7 @@ class Scenario(NamedTuple):
 
 
 class RecordPolicy(NamedTuple):
-    """Of which tests the motion is recorded."""
+    """Which tests' motion is recorded: by the policy ``traces``, and a share by the hash of their index."""
 
     traces: str
     trace_share: float
@@ -67,7 +67,7 @@ class RecordPolicy(NamedTuple):
         return self.traces != "none" or self.trace_share > 0.0
 
     def wants(self, outcome: int, n_control_steps: int) -> bool:
-        """Whether to keep the motion of an episode that ended so."""
+        """Whether the policy keeps the motion of an episode with this end."""
         if self.traces in ("crash", "critical"):
             return outcome in (CRASH, FAILED) or (self.traces == "critical" and n_control_steps > 0)
         return self.traces == "all"
@@ -75,11 +75,11 @@ class RecordPolicy(NamedTuple):
 
 @dataclass
 class Shard:
-    """Everything that a range of tests left behind, row by row.
+    """All results of a range of tests, by row.
 
-    ``episode`` (n,) are their results, `harness.loop.cells.EPISODE_DTYPE`; ``traffic`` is what the others did, and
-    ``events`` are those of the pool that were prescribed, if any were. ``traces`` maps a test's row to its
-    (steps + 1, V, 4: x, v, a, lane) motion, ``failures`` to the cause.
+    ``episode`` (n,) are `harness.loop.cells.EPISODE_DTYPE` records; ``traffic`` is what the others did, and ``events``
+    are those of the pool that were prescribed, if any were. ``traced`` (n,) is whose motion is kept whatever the end.
+    ``traces`` maps a test's row to its (steps + 1, V, 4: x, v, a, lane) motion, ``failures`` to the cause.
     """
 
     first_episode: int
@@ -93,7 +93,7 @@ class Shard:
 
 
 def hash_of_index(seed: int, episodes: IntArray) -> FloatArray:
-    """A number in [0, 1) for each episode, which cannot depend on its outcome."""
+    """A pseudo-random number in [0, 1) for each episode, by its index: it cannot depend on the outcome."""
     mixed = (episodes.astype(np.uint64) + np.uint64(seed)) * np.uint64(0x9E3779B97F4A7C15)
     mixed ^= mixed >> np.uint64(29)
     mixed *= np.uint64(0xBF58476D1CE4E5B9)
@@ -112,22 +112,23 @@ class EpisodeLoop:
         self._cells = idle_cells(world.n_cells, len(scenario.vehicles), scenario.max_steps, keep_traces=keep.any_trace)
 
     def run(self, first_episode: int, traffic: Traffic) -> Shard:
-        """Run tests ``first_episode … first_episode + n − 1`` of the campaign, in which the others do so.
+        """Run the campaign's tests ``first_episode … first_episode + n − 1`` with this traffic (n tests).
 
         Raises `WorldDisagreementError`: the world did something else than it was told. Raises `CampaignError`: the
-        vehicle has replaced what the harness calls, or changed the simulation, whatever came of that.
+        vehicle has replaced functions that the harness calls, or has changed the simulation.
         """
         n = len(traffic)
         traced = hash_of_index(self._scenario.seed, first_episode + np.arange(n)) < self._keep.trace_share
         shard = Shard(first_episode, self._scenario, traffic, np.zeros(n, EPISODE_DTYPE), traced)
         self._cells.cell["row"] = -1
-        kernel, given, ended, turn = self._kernel_state(shard), 0, 0, 0
+        kernel = self._kernel_state(shard)
+        given = ended = turn = 0
         traffic.begin(self._world.n_cells)
         try:
             while True:
                 turn += 1
                 if self._av is not None and turn % self._scenario.max_steps == 0:
-                    self._av.require_untouched()  # a test may not end any more
+                    self._av.require_untouched()  # if it has changed the simulation, tests may never end
                 placed = refill(kernel, given)
                 traffic.move(kernel, placed)
                 if self._av is not None:
@@ -165,8 +166,9 @@ class EpisodeLoop:
             self._av.close()
 
     def _kernel_state(self, shard: Shard) -> KernelState:
-        """All that kernels need for a shard, in the form that they need it in."""
-        scenario, early = self._scenario, (self._av or self._world).acts_before_event
+        """What kernels need for a shard, in the form that they take."""
+        scenario = self._scenario
+        acts_early = (self._av or self._world).acts_before_event
         cruises = scenario.driver["cruises"].all() if self._av is None else self._av.cruises
         return unboxed(
             KernelState(
@@ -183,7 +185,7 @@ class EpisodeLoop:
                 driver=scenario.driver,
                 keep_traces=int(self._keep.any_trace),
                 observation=self._observation,
-                acts_early=int(early),
+                acts_early=int(acts_early),
                 av_cruises=int(cruises),
             )
         )
@@ -206,9 +208,9 @@ class EpisodeLoop:
         return self._fail(failures, kernel, shard)
 
     def _warm_up(self, av: ControllerHost, seen: BatchObservation, shard: Shard) -> dict[int, str]:
-        """Show controllers that are asked for the first time in their episode what was before; returns who failed."""
+        """Show the past to controllers that are about to act for the first time in their episode; returns failures."""
         cell, failures = self._cells.cell[seen.cell], dict[int, str]()
-        new = (cell["step"] == cell["acts_from"]) & (cell["acts_from"] > 0)  # who follows has had its warm-up
+        new = (cell["step"] == cell["acts_from"]) & (cell["acts_from"] > 0)  # those that act from the start get none
         if new.any():
             for before in self._past.before(BatchObservation._make(column[new] for column in seen)):
                 asked, failed = av.act(before, warms_up=True)
@@ -217,7 +219,7 @@ class EpisodeLoop:
         return failures
 
     def _step_and_judge(self, kernel: KernelState, shard: Shard, placed: int) -> int:
-        """Let the world take the step, and end what is over; returns how many episodes that are."""
+        """Let the world take the step, and end the tests that are over; returns their number."""
         cells, world = self._cells, self._world
         try:
             if placed:
@@ -252,18 +254,18 @@ class EpisodeLoop:
         return len(failures)
 
     def _ended(self, n: int) -> list[tuple[int, int]]:
-        """Cells whose episode has just ended, and its rows."""
+        """Cells of the ``n`` episodes that have just ended, and their rows."""
         return list(zip(self._cells.ended[:n].tolist(), self._cells.ended_row[:n].tolist(), strict=True))
 
     def _keep_traces(self, n: int, shard: Shard) -> None:
-        """Copy the motion of those of the ``n`` episodes that have just ended which is to be kept."""
+        """Copy the motion that is to be kept of the ``n`` episodes that have just ended."""
         if not self._keep.any_trace:
             return
         for k, row in self._ended(n):
             episode = shard.episode[row]
             if shard.traced[row] or self._keep.wants(int(episode["outcome"]), int(episode["n_control_steps"])):
                 trace = shard.traces[row] = self._cells.trace[k, : int(episode["n_steps"]) + 1].copy()
-                if self._world.drives_av:  # nobody commanded what the AV did: its speeds say it
+                if self._world.drives_av:  # the AV's acceleration was not commanded here: it follows from its speeds
                     trace[:-1, -1, 2] = np.diff(trace[:, -1, 1]) / STEP_S
 
 

@@ -17,8 +17,8 @@ from harness.vocabulary import RecordArray
 class Traffic:
     """What the others do in the tests of a shard: here they repeat a ``script``.
 
-    A family whose events are drawn in the loop has a class of its own, with the same methods; ``drawn`` is then what it
-    knows beside the facts, as columns of the tests' table and as control steps (`harness.records.schemas`).
+    A family whose events are drawn in the loop has a class of its own, with the same methods. Its ``drawn`` is then
+    recorded beside the facts, as columns of the tests' table and as control steps (`harness.records.schemas`).
     """
 
     drawn: Any = None
@@ -35,25 +35,25 @@ class Traffic:
         return self._facts
 
     def rows(self, rows: slice) -> Traffic:
-        """That of some tests alone."""
+        """The traffic of some of the tests."""
         return Traffic(self.script.rows(rows), self._facts[rows])
 
     def begin(self, n_cells: int) -> None:
         """Make room for the tests of a shard, which run in K cells."""
 
     def move(self, kernel: KernelState, placed: int) -> None:  # noqa: ARG002 - a script begins with the test
-        """Say what the others do in the coming step; in the first ``placed`` cells tests begin."""
+        """Command the others for the coming step; ``placed`` is the number of cells in which a test begins."""
         repeat(kernel)
 
     def finish(self, kernel: KernelState, n: int) -> None:
-        """Keep what is known of the ``n`` tests that have just ended."""
+        """Record the ``n`` tests that have just ended."""
 
 
 @compiled
 def refill(kernel: KernelState, given: int) -> int:
-    """Give every idle cell the next test of the shard, of which ``given`` rows have been given before.
+    """Begin the next tests of the shard in idle cells, after the first ``given`` rows; returns how many.
 
-    The world's ``x`` and ``v`` receive their placement, ``cells.placed`` their cells; returns how many there are.
+    The world's ``x`` and ``v`` receive the placement of their vehicles, ``cells.placed`` their cells.
     """
     n, cells, script = 0, kernel.cells, kernel.script
     for k in range(cells.cell.size):
@@ -75,13 +75,14 @@ def refill(kernel: KernelState, given: int) -> int:
 def begin_cell(k: int, row: int, kernel: KernelState) -> None:
     """Reset cell ``k`` for the test of a row."""
     script, av = kernel.script, kernel.x.shape[1] - 1
-    cell, test, episode = kernel.cells.cell[k], kernel.episode[row], kernel.first_episode + row
+    cell, test = kernel.cells.cell[k], kernel.episode[row]
+    episode = kernel.first_episode + row
     cell.row, cell.episode, cell.step, cell.lead, cell.motion_hash = row, episode, 0, 0, 0
     cell.event_step = cell.planned = cell.onset_step = -1
     cell.acts_from = 0 if kernel.acts_early else script.acts_from[row]
-    cell.cruises, told = kernel.av_cruises if cell.acts_from > 0 else 0, script.set_speed_mps[row]
-    cell.av_speed = kernel.v[k, av]
-    cell.set_speed = cell.av_speed if math.isnan(told) else told
+    cell.cruises = kernel.av_cruises if cell.acts_from > 0 else 0
+    cell.av_speed, set_speed = kernel.v[k, av], script.set_speed_mps[row]
+    cell.set_speed = cell.av_speed if math.isnan(set_speed) else set_speed
     cell.announced_index = script.announced_index[row] if script.announced_index[row] >= 0 else episode
     cell.danger = test.min_ttc_s = test.end_ttc_s = math.inf
     test.took_over_step, test.component = -1, script.stratum[row]
@@ -97,7 +98,7 @@ def begin_cell(k: int, row: int, kernel: KernelState) -> None:
 
 @compiled
 def repeat(kernel: KernelState) -> None:
-    """The others do in every cell what the script prescribes."""
+    """Command the others in every cell as the script prescribes."""
     cells, script = kernel.cells, kernel.script
     for k in range(cells.cell.size):
         cell = cells.cell[k]
@@ -112,7 +113,7 @@ def repeat(kernel: KernelState) -> None:
             test.fell_behind = cell.acts_from == 0 and is_far_behind(k, kernel)
         if cell.step == script.at[cell.row]:
             note_event(k, kernel)
-            test.n_control_steps += test.component >= 0 or test.log_weight != 0.0  # drawn otherwise than traffic would
+            test.n_control_steps += test.component >= 0 or test.log_weight != 0.0  # not drawn by its own probability
 
 
 @compiled_inline
@@ -124,7 +125,7 @@ def is_far_behind(k: int, kernel: KernelState) -> bool:
 
 @compiled_inline
 def note_event(k: int, kernel: KernelState) -> None:
-    """The event is in this step: keep where the principal vehicle is."""
+    """Record that the event is in this step, and where the principal vehicle is."""
     cell = kernel.cells.cell[k]
     test, cell.event_step = kernel.episode[cell.row], cell.step
     if cell.onset_step < 0:
