@@ -1,6 +1,6 @@
-"""Where things are in a run folder, and how they are written and read.
+"""The files of a run folder, and how they are written and read.
 
-Whatever reads raises a `RunFolderError` that names a file which is missing, damaged, or not what a run has written.
+Functions that read raise a `RunFolderError` that names a file which is missing, damaged, or not what a run has written.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from harness.vocabulary import StoppedBy
 
 T = TypeVar("T")
 Tables = dict[str, pa.Table]
-"""Tables of the same tests that are kept, by name."""
+"""Tables of the same tests, by name."""
 
 MANIFEST = "manifest.json"
 CAMPAIGN = "campaign.yaml"
@@ -35,21 +35,21 @@ SHELLS = "shells.json"
 ESTIMATES, SENSITIVITY = "estimates.json", "sensitivity.json"
 TABLES = ("episodes", "moments", "traces")
 SHADOW, MILDER = BEFORE = ("shadow", "milder")
-"""Tables of what comes before tests that count: baseline runs, which keep their first name, and milder events."""
+"""Tables of what comes before tests that count: baseline runs (of old named shadow), and milder events."""
 SEAL = "crc32"
 """Key of a JSON file's checksum."""
 NO_RUN = "Give a folder that `harness run` has written."
 
 
 def require_place(folder: Path) -> None:
-    """Refuse a folder in which nothing can be written, before work is spent on it; leaves it as it was."""
+    """Refuse a folder in which nothing can be written, before work is spent on it; the folder is not changed."""
     with _made(folder):
         pass
 
 
 @contextmanager
 def _made(folder: Path) -> Iterator[None]:
-    """Make a folder to write in; what of it and of those above was new and stays empty, goes again."""
+    """Make a folder to write in; afterwards remove new folders, it and those above, that are still empty."""
     new = [path for path in (folder, *folder.parents) if not path.exists()]
     try:
         try:
@@ -68,7 +68,7 @@ def _made(folder: Path) -> Iterator[None]:
 
 @contextmanager
 def sole_use(folder: Path) -> Iterator[None]:
-    """Make a run folder and keep other processes from running into it; if it was new and stays empty, it goes again."""
+    """Make a run folder and lock it against other processes; a new one that stays empty is removed again."""
     with _made(folder):
         handle = os.open(folder, os.O_RDONLY)
         try:
@@ -91,7 +91,7 @@ def write_bytes(path: Path, content: bytes) -> None:
 
 
 def write_together(contents: Mapping[Path, bytes]) -> None:
-    """Write files atomically, the first one last; none is put in place before all of them are written."""
+    """Write files atomically: all are written before any is put in place, the first one last."""
     (path, content), *others = contents.items()
 
     def write(temporary: Path) -> None:
@@ -109,7 +109,7 @@ def write_json(path: Path, content: Any) -> None:
 
 
 def write_sealed(path: Path, content: Mapping[str, Any]) -> None:
-    """Write a JSON file that `read_as` will read, with a checksum of its values as the last of them."""
+    """Write a JSON file for `read_as`: a checksum of its values is the last of them."""
     values = {key: value for key, value in content.items() if key != SEAL}
     write_json(path, {**values, SEAL: _seal(values)})
 
@@ -119,7 +119,7 @@ def _seal(values: Mapping[str, Any]) -> int:
 
 
 def require_sum(path: Path, crc32: int | None, content: bytes, mend: str) -> None:
-    """Refuse (`RunFolderError`) a file whose ``content`` has another checksum than the manifest tells of, if any."""
+    """Refuse (`RunFolderError`) a file whose ``content`` has another checksum than the manifest's, if that has one."""
     if crc32 is not None and (found := zlib.crc32(content)) != crc32:
         expected = f"{crc32:08x} (manifest.json): the file as the run has left it"
         raise RunFolderError(str(path), f"a changed or damaged file: checksum {found:08x}", expected, mend)
@@ -128,14 +128,15 @@ def require_sum(path: Path, crc32: int | None, content: bytes, mend: str) -> Non
 def parquet(table: pa.Table) -> bytes:
     """A table as the content of a file: the same bytes whether its rows come from here, a worker, or another file.
 
-    Arrow calls the values of a list "item", Parquet "element", and pickling keeps either of some lists only.
+    Arrow calls the values of a list "item", Parquet "element", and pickling keeps the name only of some lists.
     """
-    lists = {
-        i: pa.list_(pa.field("element", field.type.value_type), getattr(field.type, "list_size", -1))
-        for i, field in enumerate(table.schema)
-        if hasattr(field.type, "value_field")
-    }
-    schema = pa.schema([field.with_type(lists.get(i, field.type)) for i, field in enumerate(table.schema)])
+
+    def renamed(kind: pa.DataType) -> pa.DataType:
+        if not hasattr(kind, "value_field"):
+            return kind
+        return pa.list_(pa.field("element", kind.value_type), getattr(kind, "list_size", -1))
+
+    schema = pa.schema([field.with_type(renamed(field.type)) for field in table.schema])
     table = pa.Table.from_arrays(table.columns, schema=schema.with_metadata(table.schema.metadata))
     sink = pa.BufferOutputStream()
     pq.write_table(table, sink, compression="zstd", write_page_checksum=True)
@@ -143,19 +144,19 @@ def parquet(table: pa.Table) -> bytes:
 
 
 def write_part(folder: Path, shards: Sequence[Tables], first: int, n: int) -> Part:
-    """Write tables of consecutive tests, a file for each that has rows; they count once a manifest lists them."""
+    """Write tables of consecutive tests, a file for each name that has rows; they count once a manifest lists them."""
     files = {}
     for name in sorted({name for shard in shards for name in shard}):
-        if kept := [shard[name] for shard in shards if name in shard and shard[name].num_rows]:
+        if tables := [shard[name] for shard in shards if name in shard and shard[name].num_rows]:
             path = f"{name}/{first:09d}-{first + n:09d}.parquet"
-            content = parquet(concatenated(kept, folder))
+            content = parquet(concatenated(tables, folder))
             write_bytes(folder / path, content)
-            files[name] = File(path, sum(table.num_rows for table in kept), zlib.crc32(content))
+            files[name] = File(path, sum(table.num_rows for table in tables), zlib.crc32(content))
     return Part(first, n, files)
 
 
 def remove_unlisted(folder: Path, parts: Iterable[Part]) -> None:
-    """Remove files of tables that no part lists."""
+    """Remove files of tables that none of the parts lists."""
     listed = {folder / file.path for part in parts for file in part.files.values()}
     for table in (*TABLES, *BEFORE):
         for path in set((folder / table).glob("*.parquet")) - listed:
@@ -163,7 +164,7 @@ def remove_unlisted(folder: Path, parts: Iterable[Part]) -> None:
 
 
 def arrow_file(content: bytes) -> pa.BufferReader:
-    """A file in memory of Arrow's own: a thread that lets go of Python's as the process ends would abort that."""
+    """A file in Arrow's own memory: a reader thread that frees Python's memory as the process ends would abort it."""
     sink = pa.BufferOutputStream()
     sink.write(content)
     return pa.BufferReader(sink.getvalue())
@@ -172,7 +173,7 @@ def arrow_file(content: bytes) -> pa.BufferReader:
 def read_table(
     path: Path, columns: list[str] | None = None, *, crc32: int | None = None, mend: str = MEND_PART
 ) -> pa.Table:
-    """Read one Parquet file of a run, opened once: what is decoded has the checksum ``crc32``, or its pages theirs."""
+    """Read one Parquet file of a run; its checksum ``crc32`` is verified or, without one, those of its pages."""
     try:
         content = path.read_bytes()
         require_sum(path, crc32, content, mend)
@@ -189,11 +190,11 @@ def read_table(
 def read_kept(folder: Path, part: Part, table: str, columns: list[str] | None = None) -> pa.Table:
     """One table of a part, with as many rows as the manifest says; see `read_table`."""
     file = part.files[table]
-    found = read_table(folder / file.path, columns, crc32=file.crc32)
-    if found.num_rows != file.n_rows:
+    content = read_table(folder / file.path, columns, crc32=file.crc32)
+    if content.num_rows != file.n_rows:
         expected = f"{file.n_rows} rows (manifest.json)"
-        raise RunFolderError(str(folder / file.path), f"{found.num_rows} rows", expected, MEND_PART)
-    return found
+        raise RunFolderError(str(folder / file.path), f"{content.num_rows} rows", expected, MEND_PART)
+    return content
 
 
 def concatenated(tables: Sequence[pa.Table], folder: Path) -> pa.Table:
@@ -206,14 +207,14 @@ def concatenated(tables: Sequence[pa.Table], folder: Path) -> pa.Table:
 
 
 def damaged(path: Path, error: Exception, mend: str = MEND_PART, kind: str = "a whole Parquet file") -> RunFolderError:
-    """What to say of a file of a run that cannot be read; one that may not be read is nothing to delete."""
-    missing, closed = isinstance(error, FileNotFoundError), isinstance(error, PermissionError)
+    """The error for a file of a run that cannot be read; ``mend`` is the advice unless its permissions forbid it."""
+    missing, forbidden = isinstance(error, FileNotFoundError), isinstance(error, PermissionError)
     found = "no such file" if missing else f"a file that cannot be read ({str(error).splitlines()[0]})"
-    return RunFolderError(str(path), found, kind, "Change its permissions." if closed else mend)
+    return RunFolderError(str(path), found, kind, "Change its permissions." if forbidden else mend)
 
 
 def no_episodes(folder: Path) -> RunFolderError:
-    """What to say of a run that was ended before its first shard was finished."""
+    """The error for a run that was ended before its first shard was finished."""
     found = "a run that has not finished a test yet"
     return RunFolderError(str(folder), found, "tests on record", "Let `harness run` go on with --resume.")
 
@@ -224,7 +225,7 @@ TablePath = Annotated[str, Field(pattern=r"^[a-z]+/[A-Za-z0-9_-]+\.parquet$")]
 
 @dataclass(frozen=True)
 class File:
-    """A file of a run folder, which counts as long as it has its checksum, where that is known."""
+    """A file of a run folder: where it is, its number of rows and, where it is known, its checksum."""
 
     path: TablePath
     n_rows: Count
@@ -247,7 +248,7 @@ class Part:
 
 @dataclass(frozen=True)
 class Repeated:
-    """How many tests were run once more, and which of them (campaign indices) came out otherwise."""
+    """How many tests were run twice, and which of them (campaign indices) came out otherwise the second time."""
 
     n_episodes: Count
     differing: list[Count]
@@ -257,9 +258,9 @@ class Repeated:
 
 
 class StoredManifest(BaseModel):
-    """What ``manifest.json`` of a run must hold, and of what it may hold that which answers rest on.
+    """Keys of ``manifest.json`` that are required, and optional ones that answers rest on.
 
-    Any other key is let through: the file's checksum says that it is as a run has written it.
+    Other keys are not checked one by one: the file's checksum covers them.
     """
 
     model_config = ConfigDict(extra="allow", strict=True, allow_inf_nan=False)
@@ -286,12 +287,12 @@ def read_manifest(folder: Path, *, mend: str = NO_RUN) -> dict[str, Any]:
             mend = f"Name one, such as {runs[0].parent}. If it is not finished, `harness run` with --resume goes on."
             raise RunFolderError(str(folder), "a folder of several runs", "the run folder of one", mend)
         raise RunFolderError(str(path), "no such file: this is no run folder", expected, mend)
-    found = read_as(StoredManifest, path, mend=mend)
-    return {**found.model_dump(exclude_unset=True), "parts": found.parts, "before": found.before}
+    manifest = read_as(StoredManifest, path, mend=mend)
+    return {**manifest.model_dump(exclude_unset=True), "parts": manifest.parts, "before": manifest.before}
 
 
 def read_as(kind: type[T], path: Path, *, mend: str) -> T:
-    """Read a JSON file of a run as a type; one that no run has written is refused by the first value that is wrong."""
+    """Read a JSON file of a run as a type; a file that no run has written is refused, naming its first wrong value."""
     expected = "a JSON file of a run"
     try:
         content = path.read_bytes()

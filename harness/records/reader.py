@@ -1,4 +1,4 @@
-"""Read what a run has left: its campaign, motion of a few tests, and what pages show of all; and replicates of traffic.
+"""Read a run's campaign, traces of a few tests, and what pages show of all tests; read replicates of traffic.
 
 Every function raises a `RunFolderError` that names a file which is missing or damaged.
 """
@@ -45,7 +45,7 @@ from harness.resolved import resolve
 from harness.vocabulary import FAMILIES
 
 N_READERS = 2
-"""Threads; each holds a part."""
+"""Threads that read; each holds one part in memory."""
 OF_REPLICATES = b"harness fit"
 """Key in the metadata of a file of replicates: hash of the numbers that they belong to."""
 
@@ -66,7 +66,7 @@ def read_campaign(folder: Path, manifest: Mapping[str, Any], *, check_files: boo
     crc32 = manifest.get("campaign_crc32")
     require_sum(path, crc32, path.read_bytes(), mend)
     if crc32 is None:  # its run was killed as it began
-        with suppress(CampaignError):  # its environment file is gone: nobody can tell
+        with suppress(CampaignError):  # its environment file is gone: it cannot be checked
             require_campaign(path, resolve(campaign).content_hash, manifest)
     return campaign
 
@@ -80,7 +80,7 @@ def require_campaign(path: Path, content_hash: str, manifest: Mapping[str, Any])
 
 
 def traffic_of(campaign: Campaign, manifest: Mapping[str, Any]) -> Environment | None:
-    """The run's traffic, where its parameters are still what they were; else others cannot be driven."""
+    """The run's traffic; None where its parameters have changed since."""
     with suppress(CampaignError):
         resolved = resolve(campaign)
         return resolved.environment if resolved.content_hash == manifest["campaign_hash"] else None
@@ -89,47 +89,48 @@ def traffic_of(campaign: Campaign, manifest: Mapping[str, Any]) -> Environment |
 
 def read_traces(folder: Path, parts: Sequence[Part], episodes: Collection[int]) -> pa.Table | None:
     """Trace rows of a few episodes; None where none of them was traced."""
-    found = []
+    traces = []
     for part in parts:
         if "traces" in part.files and any(part.first_episode <= episode < part.end for episode in episodes):
             table = read_kept(folder, part, "traces")
-            found.append(table.filter(pc.is_in(table["episode"], pa.array(sorted(episodes)))))
-    return concatenated(found, folder) if any(table.num_rows for table in found) else None
+            traces.append(table.filter(pc.is_in(table["episode"], pa.array(sorted(episodes)))))
+    return concatenated(traces, folder) if any(table.num_rows for table in traces) else None
 
 
 def read_replicates(name: str, parameters: ParameterFile, shipped: Path) -> list[dict[str, float]]:
-    """Numbers that vary, by replicate, of an environment, a ``shipped`` name or a path; refused if of others."""
-    file, tied = shipped_or_own(name, shipped, "environment.parameters"), parameters.replicates
-    if tied is None:
+    """Numbers that vary, by replicate, of an environment (a ``shipped`` name or a path); refused if of another's."""
+    file, replicates = shipped_or_own(name, shipped, "environment.parameters"), parameters.replicates
+    if replicates is None:
         return []
-    path, again = file.parent / tied.file, "Write it anew with `harness fit`, or leave out the key replicates."
-    table = read_table(path, mend=again)
-    of, expected = (table.schema.metadata or {}).get(OF_REPLICATES), f"the replicates that {file.name} was written with"
-    if content_hash(path.read_bytes()) != tied.sha256:
-        raise RunFolderError(str(path), "replicates of another fit, or changed ones", expected, again)
-    if of != parameters.content_hash().encode():
-        raise RunFolderError(str(path), f"replicates of other numbers than those of {file.name}", expected, again)
+    path, mend = file.parent / replicates.file, "Write it anew with `harness fit`, or leave out the key replicates."
+    table = read_table(path, mend=mend)
+    numbers_hash = (table.schema.metadata or {}).get(OF_REPLICATES)
+    expected = f"the replicates that {file.name} was written with"
+    if content_hash(path.read_bytes()) != replicates.sha256:
+        raise RunFolderError(str(path), "replicates of another fit, or changed ones", expected, mend)
+    if numbers_hash != parameters.content_hash().encode():
+        raise RunFolderError(str(path), f"replicates of other numbers than those of {file.name}", expected, mend)
     rows: list[dict[str, float]] = table.to_pylist()
     return rows
 
 
-# -- whether a folder was made on this machine by this user: else a replay runs code that somebody else has named. A key
-# of the user's own signs each run's campaign.yaml; a folder that is moved keeps its signature --
+# -- whether a folder was made on this machine by this user: if not, a replay would run code that somebody else named. A
+# key of the user's own signs each run's campaign.yaml; a folder that is moved keeps its signature --
 
 
 def signature(campaign: bytes) -> str | None:
-    """What a manifest says of its campaign, so that `require_trust` knows it again; None for a user without a home."""
+    """Signature of a campaign for the manifest, which `require_trust` checks; None for a user without a home."""
     key = _key()
     return None if key is None else hmac.new(key, campaign, "sha256").hexdigest()
 
 
 def code_of(av: AutomatedVehicle) -> str | None:
-    """Code of the user's that a vehicle runs in processes of the harness; None if it is no such vehicle."""
+    """The user's own code that a vehicle runs in processes of the harness; None for a vehicle without any."""
     return av.controller or (None if av.fmu is None else av.fmu.file)
 
 
 def require_trust(folder: Path, manifest: Mapping[str, Any], code: str | None, mend: str) -> None:
-    """Refuse (`RunFolderError`) to run ``code`` that a folder names which this user has not made on this machine."""
+    """Refuse (`RunFolderError`) to run ``code`` named by a folder that this user has not made on this machine."""
     signed = signature((folder / CAMPAIGN).read_bytes())
     if code is not None and (signed is None or not hmac.compare_digest(signed, str(manifest.get("signature")))):
         found = f"a run that was not made on this machine by this user; it names {code}, which would be run"
@@ -138,9 +139,9 @@ def require_trust(folder: Path, manifest: Mapping[str, Any], code: str | None, m
 
 def _key() -> bytes | None:
     """The user's key, made when it is first asked for; None where there is no place for one."""
-    with suppress(OSError, RuntimeError):  # nobody knows where this user is at home
+    with suppress(OSError, RuntimeError):  # the user's home is unknown, or cannot be written
         path = platformdirs.user_config_path("harness") / "key"
-        if not path.is_absolute():  # so say older versions of that package
+        if not path.is_absolute():  # older versions of platformdirs give this for an unknown home
             return None
         unfinished = path.with_name(f".{uuid.uuid4().hex}.part")
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -161,7 +162,7 @@ COLUMNS = (
     "event_gap_m", "event_rate_mps",
 )  # fmt: skip
 _NUMBER = re.compile(r"(?<!\.py:)(?<!\d)-?\d[\d.]*(e[-+]?\d+)?")
-"""But for the line of the user's code: other lines are other faults."""
+"""A number in a failure's cause, but not the line of the user's code: other lines are other faults."""
 
 
 @dataclass(frozen=True)
@@ -169,8 +170,8 @@ class ShownTests:
     """Consecutive tests of a run.
 
     ``outcomes``, and ``causes`` of failures, are counted over all. ``rows`` are of tests that had an event or a weight
-    other than 1: `COLUMNS`, outcome, facts that are numbers. Of the others, most in plain naturalistic driving, there
-    is nothing to draw. ``crashes`` are what the motion of crashes follows from.
+    other than 1, with `COLUMNS`, outcome, and facts that are numbers; there is nothing to draw of the others, which are
+    most in plain naturalistic driving. ``crashes`` has the columns that the motion of crashes follows from.
     """
 
     outcomes: Counter[str]
@@ -180,8 +181,8 @@ class ShownTests:
 
     @classmethod
     def of(cls, episodes: pa.Table, family: Family) -> ShownTests:
-        """What is shown of rows of the episodes table."""
-        rows, motion = _columns(family, sees=LEAD in episodes.column_names)
+        """From rows of the episodes table."""
+        rows, motion = _columns(family, shows=LEAD in episodes.column_names)
         outcome = episodes["outcome"].cast(pa.string())
         shown = pc.or_(pc.is_valid(episodes["event_step"]), pc.not_equal(episodes["log_weight"], 0.0))
         return cls(
@@ -193,18 +194,19 @@ class ShownTests:
 
     @classmethod
     def stored(cls, folder: Path, manifest: Mapping[str, Any], family: Family) -> ShownTests:
-        """Those of a run folder; a `RunFolderError` where a file is damaged or missing, or no test is there."""
-        asked = {"failure", *(name for of in _columns(family, sees=manifest["events_show"]) for name in of)}
+        """From a run folder; a `RunFolderError` where a file is damaged or missing, or no test is there."""
+        rows, motion = _columns(family, shows=manifest["events_show"])
+        columns = sorted({"failure", *rows, *motion})
 
         def shown(part: Part) -> ShownTests:
-            episodes = read_kept(folder, part, "episodes", sorted(asked))
+            episodes = read_kept(folder, part, "episodes", columns)
             return cls.of(episodes.slice(0, max(manifest["n_episodes"] - part.first_episode, 0)), family)
 
         return cls.joined(list(made_ahead(shown, manifest["parts"], N_READERS)), folder)
 
     @classmethod
     def joined(cls, parts: Sequence[ShownTests], folder: Path) -> ShownTests:
-        """All tests of the run in a folder."""
+        """Consecutive parts of a run as one; a `RunFolderError` without any."""
         if not parts:
             raise no_episodes(folder)
         return cls(
@@ -215,36 +217,40 @@ class ShownTests:
         )
 
 
-def _columns(family: Family, *, sees: bool) -> tuple[list[str], list[str]]:
-    numbers = [each.name for each in family.columns if not each.length]
-    return [*COLUMNS, *numbers, "outcome"], [*path_columns(family), *([LEAD] if sees else []), "outcome"]
+def _columns(family: Family, *, shows: bool) -> tuple[list[str], list[str]]:
+    """Columns of ``rows`` and of ``crashes`` of `ShownTests`."""
+    numbers = [column.name for column in family.columns if not column.length]
+    return [*COLUMNS, *numbers, "outcome"], [*path_columns(family), *([LEAD] if shows else []), "outcome"]
 
 
 def hardest_crash(folder: Path) -> tuple[Path, int]:
-    """Run folder and number of the crash at the largest impact speed, the first of equals; of a sum, of all its runs.
+    """Run folder and number of the test with the largest impact speed, the first of equals; of a sum, of all its runs.
 
-    Raises `RunFolderError`: there is none.
+    Raises `RunFolderError`: there is no crash.
     """
-    several, crashes = (folder / FAMILIES).is_file(), list[tuple[float, int, Path]]()
-    for run in [each.parent for each in sorted(folder.glob("*/manifest.json"))] if several else [folder]:
+    runs = [folder]
+    if (folder / FAMILIES).is_file():
+        runs = [manifest.parent for manifest in sorted(folder.glob("*/manifest.json"))]
+    crashes = list[tuple[float, int, Path]]()
+    for run in runs:
         if not (parts := read_manifest(run)["parts"]):
             raise no_episodes(run)
         for part in parts:
             columns = read_kept(run, part, "episodes", ["impact_speed_mps", "episode"]).drop_null()  # null: no crash
-            speed_mps, episode = (each.to_pylist() for each in columns.itercolumns())
-            crashes += [(-each, number, run) for each, number in zip(speed_mps, episode, strict=True)]
+            speeds_mps, episodes = (column.to_pylist() for column in columns.itercolumns())
+            crashes += [(-speed_mps, episode, run) for speed_mps, episode in zip(speeds_mps, episodes, strict=True)]
     if not crashes:
         expected, mend = "the number of a test to replay", f"Name one: harness replay {run} 0."
         raise RunFolderError(str(folder), "no crash", expected, mend)
-    _, number, run = min(crashes)
-    return run, number
+    _, episode, run = min(crashes)
+    return run, episode
 
 
 def by_kind(causes: Mapping[str, int]) -> Counter[str]:
-    """How often each kind of failure was: of causes that differ in digits alone the most frequent stands for all."""
-    shown, kinds = dict[str, str](), Counter[str]()
+    """Failures by kind, named by its most frequent cause: causes that differ in digits alone are of one kind."""
+    names, kinds = dict[str, str](), Counter[str]()
     for cause, n in sorted(causes.items(), key=lambda item: -item[1]):
-        kinds[shown.setdefault(_NUMBER.sub("0", cause), cause)] += n
+        kinds[names.setdefault(_NUMBER.sub("0", cause), cause)] += n
     return kinds
 
 

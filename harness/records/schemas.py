@@ -1,4 +1,4 @@
-"""The tables that a run leaves: Arrow schemas with units and meanings in the field metadata, and a shard's rows.
+"""The tables of a run: Arrow schemas with units and meanings in the field metadata, and tables made from a shard.
 
 Importance functions are in the order of `importance_names`: for the episode mixture the defensive ``forced`` cut-in
 first, then the surrogates; for the others the surrogates alone. Values are from `harness.loop.judge.end_test`.
@@ -47,19 +47,19 @@ def episodes_schema(
     acts: bool = False,
     shows: bool = False,
 ) -> pa.Schema:
-    """Schema of the ``episodes`` table of a family, by numbers of importance functions, surrogates, cells of shells.
+    """Schema of the ``episodes`` table, with numbers of importance functions, surrogates and cells of shells.
 
-    ``columns`` are the family's facts. Shells of vehicles that act before the event have columns of their own, and so
-    have cut-ins that take time.
+    ``columns`` are the family's facts; ``acts`` adds those of shells of vehicles that act before the event, ``shows``
+    those of events that take time.
     """
-    of_shells = [
+    shell_columns = [
         _field("cell", _I2, "1", "cell of shells.json: shell, and which references crash (method shells alone)"),
         _field("cell_mass", _per(n_cells), "1", "P of an event of each cell on the same path (method shells alone)"),
     ]
-    own = "P of the test's own event, or of those it stands for, in the measure of cell_mass"
-    of_baseline_runs = [
+    own_mass = "P of the test's own event, or of those it stands for, in the measure of cell_mass"
+    baseline_columns = [
         _or_null("shadow", _I8, "1", "baseline run that the test repeats (method shells, vehicles that act before)"),
-        _or_null("event_mass", _F8, "1", own),
+        _or_null("event_mass", _F8, "1", own_mass),
     ]
     return pa.schema(
         [
@@ -92,8 +92,8 @@ def episodes_schema(
             _field("log_q", _per(n_importance), "1", "per importance function: sum of log(q_j/p)"),
             _field("martingale", _per(n_surrogates), "1", "per surrogate: sum W_t C_j,t - W_(t-1) V_j,t"),
             _or_null("pool_row", _I8, "1", "row of the pool's event (method shells), else null"),
-            *(of_shells if n_cells else ()),
-            *(of_baseline_runs if acts else ()),
+            *(shell_columns if n_cells else ()),
+            *(baseline_columns if acts else ()),
             *(_lateral_fields() if shows else ()),
             _or_null("failure", pa.string(), "", "cause, for failed tests"),
         ]
@@ -165,7 +165,8 @@ def baseline_schema(columns: Sequence[Column]) -> pa.Schema:
 
 def shard_tables(shard: Shard, seed: int, *, keep_traces: bool) -> Tables:
     """Tables of a shard, sorted by episode, step and vehicle."""
-    tables, drawn = {"episodes": episodes_table(shard, seed)}, shard.traffic.drawn
+    tables = {"episodes": episodes_table(shard, seed)}
+    drawn = shard.traffic.drawn
     if drawn is not None and drawn.moment_limit:
         tables["moments"] = moments_table(shard)
     if keep_traces:
@@ -174,13 +175,13 @@ def shard_tables(shard: Shard, seed: int, *, keep_traces: bool) -> Tables:
 
 
 def _table(schema: pa.Schema, columns: dict[str, Any], records: RecordArray | None = None) -> pa.Table:
-    """A table of ``columns``, else of fields of ``records``; null for NaN, infinity, a step below 0."""
+    """A table of ``columns``, and of fields of ``records`` else; null for NaN, infinity, a step below 0."""
     arrays = []
     for field in schema:
         values = columns[field.name] if records is None or field.name in columns else records[field.name]
         if isinstance(values, np.ndarray):
-            none = (values < 0 if values.dtype.kind == "i" else ~np.isfinite(values)) if field.nullable else None
-            values = pa.array(np.ascontiguousarray(values), mask=none)
+            null = (values < 0 if values.dtype.kind == "i" else ~np.isfinite(values)) if field.nullable else None
+            values = pa.array(np.ascontiguousarray(values), mask=null)
         arrays.append(values)
     return pa.table(arrays, schema=schema)
 
@@ -206,7 +207,7 @@ def _names(codes: Int8Array, names: tuple[str, ...]) -> pa.Array:
 
 
 def padded(column: pa.ChunkedArray, width: int | None = None) -> tuple[np.ndarray, IntArray]:
-    """Lists (n,) as rows of zeros beyond their lengths, shape (n, width of the longest), and their lengths (n,)."""
+    """Lists (n,) as rows filled up by zeros, shape (n, ``width`` or the longest length), and their lengths (n,)."""
     lists = column.combine_chunks()
     lengths, flat = np.asarray(lists.value_lengths()).astype(np.int64), np.asarray(lists.flatten())
     places = np.arange(lengths.max(initial=0) if width is None else width)
@@ -216,51 +217,52 @@ def padded(column: pa.ChunkedArray, width: int | None = None) -> tuple[np.ndarra
 
 
 def fact_columns(facts: RecordArray, columns: Sequence[Column]) -> dict[str, Any]:
-    """The facts (n,) of a family as columns."""
+    """The facts (n,) of a family as columns of a table."""
 
-    def of(column: Column) -> Any:
+    def values_of(column: Column) -> Any:
         values = facts[column.name]
         return prefixes(values, facts[column.length]) if column.length else pa.array(np.ascontiguousarray(values))
 
-    return {column.name: of(column) for column in columns}
+    return {column.name: values_of(column) for column in columns}
 
 
 def facts_from(table: pa.Table, columns: Sequence[Column]) -> RecordArray:
-    """The facts (n,) that `fact_columns` has written."""
-    found: dict[str, np.ndarray] = {}
+    """The facts (n,) in the columns that `fact_columns` has made."""
+    fields: dict[str, np.ndarray] = {}
     for column in columns:
         values = table.column(column.name)
         if column.length:
-            found[column.name], found[column.length] = padded(values)
+            fields[column.name], fields[column.length] = padded(values)
         else:
-            found[column.name] = np.asarray(values)
-    kind = np.dtype([(name, values.dtype, values.shape[1:]) for name, values in found.items()])
-    facts: RecordArray = np.zeros(table.num_rows, kind)
-    for name, values in found.items():
-        facts[name] = values
+            fields[column.name] = np.asarray(values)
+    facts: RecordArray = np.zeros(
+        table.num_rows, np.dtype([(name, field.dtype, field.shape[1:]) for name, field in fields.items()])
+    )
+    for name, field in fields.items():
+        facts[name] = field
     return facts
 
 
 LEAD = "lead_steps"
-"""There where events can be seen before they happen."""
+"""A column of tables whose events can be seen before they happen."""
 
 
 def path_columns(family: Family) -> tuple[str, ...]:
-    """What of the episodes table determines the others' motion, `LEAD` beside it."""
+    """Columns of the episodes table that determine the others' motion, with `LEAD` where it is one."""
     return ("episode", "n_steps", "event_step", *(column.name for column in family.columns))
 
 
 def chosen_from(rows: pa.Table, family: Family) -> Chosen:
     """The events of rows (n,) of the episodes table, which has `path_columns`."""
 
-    def whole(name: str, null: int) -> IntArray:
+    def integers(name: str, null: int) -> IntArray:
         return np.asarray(rows.column(name).fill_null(null)).astype(np.int64)
 
-    lead = whole(LEAD, 0) if LEAD in rows.column_names else np.zeros(rows.num_rows, np.int64)
-    return Chosen(facts_from(rows, family.columns), whole("event_step", -1), lead)
+    lead = integers(LEAD, 0) if LEAD in rows.column_names else np.zeros(rows.num_rows, np.int64)
+    return Chosen(facts_from(rows, family.columns), integers("event_step", -1), lead)
 
 
-def _driven(shard: Shard) -> dict[str, Any]:
+def _shared_columns(shard: Shard) -> dict[str, Any]:
     """Columns that tests and baseline runs have in common."""
     e = shard.episode
     return fact_columns(shard.traffic.facts, shard.scenario.columns) | {
@@ -271,9 +273,10 @@ def _driven(shard: Shard) -> dict[str, Any]:
 
 def episodes_table(shard: Shard, seed: int) -> pa.Table:
     """One row per episode, in index order."""
-    e, n, prescribed, drawn = shard.episode, shard.episode.size, shard.events, shard.traffic.drawn
+    e, prescribed, drawn = shard.episode, shard.events, shard.traffic.drawn
+    n = e.size
     log_q, martingale = (np.zeros((n, 0)),) * 2 if drawn is None else (drawn.log_q, drawn.martingale)
-    columns = _driven(shard) | {
+    columns = _shared_columns(shard) | {
         "episode": shard.first_episode + np.arange(n),
         "seed": np.full(n, seed, np.int64),
         "log_q": rows(log_q),
@@ -292,14 +295,16 @@ def episodes_table(shard: Shard, seed: int) -> pa.Table:
             "overlap_ttc_s": _time_to_collision(e["event_gap_m"], e["event_rate_mps"]),
             "contact": pa.array(side, pa.string(), mask=e["outcome"] != CRASH),
         }
-    of_all = log_q.shape[1], martingale.shape[1], 0 if prescribed is None else prescribed.cell_mass.shape[1]
-    acts = prescribed is not None and prescribed.shadow.size > 0
-    schema = episodes_schema(shard.scenario.columns, *of_all, acts=acts, shows=shard.scenario.shows)
+    n_cells = 0 if prescribed is None else prescribed.cell_mass.shape[1]
+    acts, scenario = prescribed is not None and prescribed.shadow.size > 0, shard.scenario
+    schema = episodes_schema(
+        scenario.columns, log_q.shape[1], martingale.shape[1], n_cells, acts=acts, shows=scenario.shows
+    )
     return _table(schema, columns, e)
 
 
 def _time_to_collision(r2_m: FloatArray, r2dot_mps: FloatArray) -> FloatArray:
-    """NaN where nobody closes in, or has passed."""
+    """Time (s) to collision (n,), NaN where the AV does not close in, or has passed."""
     closing = (r2dot_mps < 0.0) & (r2_m >= 0.0)
     return np.asarray(np.divide(r2_m, -r2dot_mps, out=np.full(r2_m.shape, np.nan), where=closing))
 
@@ -312,8 +317,8 @@ def moments_table(shard: Shard) -> pa.Table:
     order = np.lexsort((m["step"], m["row"]))
     m, q, v = m[order], drawn.moment_q[:used][order], drawn.moment_v[:used][order]
     columns = {"episode": shard.first_episode + m["row"], "q": rows(q), "v": rows(v)}
-    of_state = [each for each in shard.scenario.columns if each.name in (m.dtype.names or ())]
-    return _table(moments_schema(of_state, q.shape[1]), columns, m)
+    state_columns = [column for column in shard.scenario.columns if column.name in (m.dtype.names or ())]
+    return _table(moments_schema(state_columns, q.shape[1]), columns, m)
 
 
 def traces_table(shard: Shard) -> pa.Table:
@@ -326,12 +331,12 @@ def traces_table(shard: Shard) -> pa.Table:
     row = np.repeat(rows, n_vehicles * np.array(n_states))
     step = np.repeat(np.concatenate([np.arange(n, dtype=np.int16) for n in n_states]), n_vehicles)
     vehicle = np.tile(np.arange(n_vehicles, dtype=np.int8), sum(n_states))
-    x, v, a, lane = np.concatenate([shard.traces[each].reshape(-1, 4) for each in rows]).T
+    x, v, a, lane = np.concatenate([shard.traces[traced].reshape(-1, 4) for traced in rows]).T
     over = _came_over(shard.episode[row], step, scenario.sideways_m)
     columns = {
         "episode": shard.first_episode + row, "step": step, "vehicle": _names(vehicle, scenario.vehicles),
         "lane": lane.astype(np.int8), "x_m": x, "v_mps": v,
-        "a_mps2": np.where(vehicle == n_vehicles - 1, a, np.round(a, 9)),  # the others are told speeds
+        "a_mps2": np.where(vehicle == n_vehicles - 1, a, np.round(a, 9)),  # the others' follows from their speeds
         "lateral_m": np.where(vehicle == scenario.principal, over, 0.0),
     }  # fmt: skip
     return _table(schema, columns)
@@ -347,12 +352,13 @@ def _came_over(episode: RecordArray, state: np.ndarray, distance_m: float) -> Fl
 
 def baseline_table(shard: Shard, path: IntArray, weight: FloatArray) -> pa.Table:
     """One row per baseline run of a shard that has kept all motion; ``path``, ``weight`` (n,) as in the schema."""
-    e, traces = shard.episode, [shard.traces[row] for row in range(shard.episode.size)]
-    columns = _driven(shard) | {
+    e = shard.episode
+    traces = [shard.traces[row] for row in range(e.size)]
+    columns = _shared_columns(shard) | {
         "shadow": shard.first_episode + np.arange(e.size),
         "path": path,
         "weight": weight,
-        "av_position_m": pa.array([each[:, -1, 0] for each in traces], _MOTION),
-        "av_speed_mps": pa.array([each[:, -1, 1] for each in traces], _MOTION),
+        "av_position_m": pa.array([trace[:, -1, 0] for trace in traces], _MOTION),
+        "av_speed_mps": pa.array([trace[:, -1, 1] for trace in traces], _MOTION),
     }
     return _table(baseline_schema(shard.scenario.columns), columns, e)
