@@ -150,6 +150,6 @@ def assumed(
     return asdict(Assumed(left_open.where, left_open.highest, (low, high), left_open.share))
 
 
-def ratio_of(a: FloatArray, b: FloatArray) -> FloatArray:
-    """Elementwise a / b; 1 where b is 0."""
-    return np.divide(a, b, out=np.ones_like(b), where=b > 0.0)
+def ratio_of(a: FloatArray, b: FloatArray, *, of_nothing: float = 1.0) -> FloatArray:
+    """Elementwise a / b; ``of_nothing`` where b is 0."""
+    return np.divide(a, b, out=np.full_like(b, of_nothing), where=b > 0.0)

@@ -61,6 +61,16 @@ def episodes_schema(
         _or_null("shadow", _I8, "1", "baseline run that the test repeats (method shells, vehicles that act before)"),
         _or_null("event_mass", _F8, "1", own_mass),
     ]
+    taking_time = "where cut-ins take time alone"
+    lateral_columns = [
+        _or_null("lead_steps", _I2, "0.1 s", f"from the onset of lateral motion to overlap ({taking_time})"),
+        _or_null("onset_step", _I2, "0.1 s", "step at whose end BV began to move sideways"),
+        _or_null("onset_gap_m", _F8, "m", "R2 at the onset"),
+        _or_null("onset_rate_mps", _F8, "m/s", "R2dot at the onset"),
+        _or_null("onset_ttc_s", _F8, "s", "R2/-R2dot at the onset, null where the AV does not close in"),
+        _or_null("overlap_ttc_s", _F8, "s", "the same at the cut-in decision, the last state before overlap"),
+        _or_null("contact", pa.string(), "", "of a crash: side, in the first state of overlap, or rear"),
+    ]
     return pa.schema(
         [
             _field("episode", _I8, "1", "number of the test in the campaign"),
@@ -94,23 +104,10 @@ def episodes_schema(
             _or_null("pool_row", _I8, "1", "row of the pool's event (method shells), else null"),
             *(shell_columns if n_cells else ()),
             *(baseline_columns if acts else ()),
-            *(_lateral_fields() if shows else ()),
+            *(lateral_columns if shows else ()),
             _or_null("failure", pa.string(), "", "cause, for failed tests"),
         ]
     )
-
-
-def _lateral_fields() -> list[pa.Field]:
-    about = "where cut-ins take time alone"
-    return [
-        _or_null("lead_steps", _I2, "0.1 s", f"from the onset of lateral motion to overlap ({about})"),
-        _or_null("onset_step", _I2, "0.1 s", "step at whose end BV began to move sideways"),
-        _or_null("onset_gap_m", _F8, "m", "R2 at the onset"),
-        _or_null("onset_rate_mps", _F8, "m/s", "R2dot at the onset"),
-        _or_null("onset_ttc_s", _F8, "s", "R2/-R2dot at the onset, null where the AV does not close in"),
-        _or_null("overlap_ttc_s", _F8, "s", "the same at the cut-in decision, the last state before overlap"),
-        _or_null("contact", pa.string(), "", "of a crash: side, in the first state of overlap, or rear"),
-    ]
 
 
 def moments_schema(columns: Sequence[Column], n_surrogates: int) -> pa.Schema:
@@ -235,9 +232,8 @@ def facts_from(table: pa.Table, columns: Sequence[Column]) -> RecordArray:
             fields[column.name], fields[column.length] = padded(values)
         else:
             fields[column.name] = np.asarray(values)
-    facts: RecordArray = np.zeros(
-        table.num_rows, np.dtype([(name, field.dtype, field.shape[1:]) for name, field in fields.items()])
-    )
+    kind = np.dtype([(name, field.dtype, field.shape[1:]) for name, field in fields.items()])
+    facts: RecordArray = np.zeros(table.num_rows, kind)
     for name, field in fields.items():
         facts[name] = field
     return facts

@@ -1,9 +1,9 @@
-"""Tests that are run again, to see whether the vehicle does the same: every bit of what they leave is compared.
+"""Tests that are run again, to see whether the vehicle does the same: every bit of their results is compared.
 
-What a test brings about follows from the campaign's seed and the test's index, as long as the AV keeps to its
-observations and to the random stream that it is given. Code that draws random numbers of its own, remembers earlier
-tests, shares state between cells, or asks a clock or its process does not; its tests cannot be replayed, and depend on
-what ran beside them.
+A test's results follow from the campaign's seed and the test's index, as long as the AV uses nothing but its
+observations and the random stream that it is given. Code that draws random numbers of its own, remembers earlier tests,
+shares state between cells, or asks a clock or its process does not; its tests cannot be replayed, and depend on what
+ran beside them.
 """
 
 from __future__ import annotations
@@ -28,25 +28,23 @@ from harness.worlds.twin import TwinWorld
 
 MOST_REPEATED, FEWEST_REPEATED = 10, 2
 ONE_OF = 10
-"""Of a shard a tenth of its tests, two at least and ten at most, half of them crashes if it has any.
-
-Of a vehicle that is random in one of four tests, ten miss all with a probability of 6 %. A rare fault shows in crashes.
-"""
+"""A tenth of a shard's tests are repeated, two at least and ten at most, half of them crashes if it has any: there a
+rare fault shows. Of a vehicle that is random in one of four tests, ten tests show nothing with a probability of 6 %."""
 
 Bits = tuple[bytes, bytes, str | None]
 DrawnTests = tuple[int, Traffic]
-"""Consecutive tests: which is the first, and what the others do in them."""
+"""Consecutive tests: the first one's index, and what the others do in them."""
 
 
 class Again(NamedTuple):
-    """What tests have left, in order, and where the vehicle has looked at a clock meanwhile."""
+    """Results of tests, in order, and the places in the vehicle's code where it has looked at a clock."""
 
     bits: list[Bits]
     clock_read_at: list[str]
 
 
 def bits_of(shard: Shard, row: int) -> Bits:
-    """Everything that a test has left: its record, its motion where that was kept, and why it failed if it did."""
+    """Everything that a test has left: its record, its motion if that was kept, and why it failed if it did."""
     trace = shard.traces.get(row)
     record = shard.episode[row].tobytes()
     return record, b"" if trace is None else trace.tobytes(), shard.failures.get(row)
@@ -54,31 +52,31 @@ def bits_of(shard: Shard, row: int) -> Bits:
 
 def run_elsewhere(source: Source, tests: Sequence[DrawnTests], n_cells: int = 1, *, held: bool = False) -> Again:
     """Run tests one after the other in a fresh process, by a clock of its own (`harness.controllers.clock`)."""
-    drawn = source.campaign.av, source.scenario, source.records(), tests, n_cells
-    return run_apart(source.campaign.av, _run_here, *drawn, held)
+    av = source.campaign.av
+    return run_apart(av, _run_here, av, source.scenario, source.records(), tests, n_cells, held)
 
 
 def _run_here(
     av: AutomatedVehicle, scenario: Scenario, keep: RecordPolicy, tests: Sequence[DrawnTests], n_cells: int, held: bool
 ) -> Again:
-    clock, found = Clock(held=held), list[Bits]()
+    clock, bits = Clock(held=held), list[Bits]()
     with clock.shown():
         host = build_host(av, n_cells=n_cells, seed=scenario.seed, names=scenario.shown)
         with closing(EpisodeLoop(TwinWorld(n_cells, scenario.vehicles), scenario, keep, host)) as loop:
             for first, traffic in tests:
                 shard = loop.run(first, traffic)
-                found += [bits_of(shard, row) for row in range(len(traffic))]
-    return Again(found, clock.read_at)
+                bits += [bits_of(shard, row) for row in range(len(traffic))]
+    return Again(bits, clock.read_at)
 
 
 def is_repeated(request: ShardRequest) -> bool:
-    """Whether tests of a shard are run twice: of the first, and of each by which their number has grown fourfold."""
+    """Whether tests of a shard are run twice: in the first, and whenever the number of tests has grown fourfold."""
     first, end = request.first_episode, request.first_episode + request.n_episodes
     return (end.bit_length() + 1) // 2 > (first.bit_length() + 1) // 2
 
 
 def repeat(loop: EpisodeLoop, source: Source, shard: Shard) -> Repeated:
-    """Run some tests of a loop's shard again, each alone: a user's code elsewhere, what SUMO drives after the shard."""
+    """Run some tests of a loop's shard again, one at a time: a user's code in a fresh process, others in the loop."""
     rows = _rows_to_repeat(shard, source.campaign)
     tests = [(shard.first_episode + row, shard.traffic.rows(slice(row, row + 1))) for row in rows]
     if has_foreign_code(source.campaign.av):
@@ -90,7 +88,7 @@ def repeat(loop: EpisodeLoop, source: Source, shard: Shard) -> Repeated:
 
 
 def _each_elsewhere(source: Source, tests: list[DrawnTests]) -> list[Bits | None]:
-    """What each leaves; None of one that ends its process, or whose controller cannot be made once more."""
+    """Bits of each test; None where it ends its process, or its controller cannot be made once more."""
     try:
         return [*run_elsewhere(source, tests).bits]
     except (HarnessError, OSError):
@@ -99,7 +97,7 @@ def _each_elsewhere(source: Source, tests: list[DrawnTests]) -> list[Bits | None
 
 
 def _rows_to_repeat(shard: Shard, campaign: Campaign) -> list[int]:
-    """Rows by a hash of their index, among those in which the AV had to act."""
+    """Rows of the tests to repeat, by a hash of their index among those in which the AV had to act."""
     episode = shard.episode
     acted = (episode["outcome"] != FAILED) & (campaign.av.acts_before_event | (episode["event_step"] >= 0))
     rows = np.flatnonzero(acted)

@@ -1,4 +1,4 @@
-"""Look before anything is spent on a campaign: what the AV does, and how fast it is."""
+"""Check an AV before a campaign: what it does in a few tests, whether it does the same again, and how fast it is."""
 
 from __future__ import annotations
 
@@ -38,15 +38,15 @@ CELLS, OTHER_CELLS = 16, 5
 """Two layouts in which every episode has other neighbours, and mostly another cell."""
 SHORTEST_TIMING_S = 0.3
 BRAKING_MPS2 = -0.1
-"""What counts as a reaction to the event."""
+"""Acceleration below which the AV has reacted to the event."""
 AT_LIMIT_MPS2 = 1e-9
 WARM_UP_EPISODES, LONGER, LONGEST_S = 12, 10.0, 60.0
-"""Tests in which the warm-up is left out, or made ten times as long."""
+"""Tests in which the warm-up is left out, or made ten times as long, up to a minute."""
 
 
 @checked("harness.av_check")
 def check_av(campaign: Campaign | str | Path, n_episodes: AtLeastTwo = EPISODES) -> AvCheck:
-    """Run a few dozen episodes with a campaign's AV, twice, and say what is to be seen.
+    """Run a few dozen episodes with a campaign's AV, twice, and report what it does.
 
     The second run has other cells, begins in the middle, and follows episodes of its own: a controller that remembers
     an earlier episode, shares state between instances or draws from a global stream gives other bits there.
@@ -60,20 +60,20 @@ def check_av(campaign: Campaign | str | Path, n_episodes: AtLeastTwo = EPISODES)
 
     Raises `HarnessError`: the campaign is wrong, or the AV cannot be found, made or started.
     """
-    asked = campaign_of(campaign)
-    tested = _as_checked(asked)
+    campaign = campaign_of(campaign)
+    tested = _as_checked(campaign)
     require_world(tested)
     source = prepare(resolve(tested, "av-check"))
     first, own_speed = _timed_run(source, n_episodes)
     if own_speed.constructions > 1:  # one for each cell
-        own_speed = replace(own_speed, constructions=asked.world.cells)
+        own_speed = replace(own_speed, constructions=campaign.world.cells)
     again = _run_in_another_order(source, n_episodes)
     idm = tested.model_copy(update={"av": AutomatedVehicle(before_event=tested.av.before_event)})
     of_idm, idm_speed = _timed_run(prepare(resolve(idm, "av-check")), n_episodes)
-    own = tested.av.limits if isinstance(tested.av.parameters, dict) else tested.av.parameters
-    limits = own.min_acceleration_mps2, own.max_acceleration_mps2
+    bounds = tested.av.limits if isinstance(tested.av.parameters, dict) else tested.av.parameters
+    limits = bounds.min_acceleration_mps2, bounds.max_acceleration_mps2
     if script := is_script(tested.av.controller or ""):  # clipped by its type's, see docs/controllers.md
-        a = np.concatenate([[], *(trace[:-1, -1, 2] for trace in first.traces.values())])  # it may have set others
+        a = np.concatenate([[], *(trace[:-1, -1, 2] for trace in first.traces.values())])  # it may change its own type
         low, high = -tested.av.traci_style.decel_mps2, tested.av.traci_style.accel_mps2
         limits = float(np.fmin.reduce(a, initial=low)), float(np.fmax.reduce(a, initial=high))
     differing = tuple(i for i in range(n_episodes) if bits_of(first, i) != again[i])
@@ -102,12 +102,12 @@ def _as_checked(campaign: Campaign) -> Campaign:
     world = campaign.world.model_copy(update={"engine": engine, "cells": CELLS})
     records = campaign.records.model_copy(update={"moments": "none", "traces": "all"})
     surrogates = campaign.surrogates or Campaign(name="default").surrogates
-    asked = {"environment": environment, "surrogates": surrogates, "testing": testing, "world": world}
-    return campaign.model_copy(update={**asked, "records": records})
+    sections = {"environment": environment, "surrogates": surrogates, "testing": testing, "world": world}
+    return campaign.model_copy(update={**sections, "records": records})
 
 
 class FirstAnswers:
-    """A host that notes, by test, what its controllers answer first once they are asked (m/s²)."""
+    """A host that notes, by test, the first answer of its controllers (m/s²)."""
 
     def __init__(self, host: ControllerHost) -> None:
         self._host, self.noted = host, dict[int, float]()
@@ -130,7 +130,7 @@ def _opened(source: Source, n_cells: int | None = None) -> Iterator[EpisodeLoop]
 
 
 def _timed_run(source: Source, n_episodes: int) -> tuple[Shard, Speed]:
-    """First run of the episodes, and the speed of the fastest of several."""
+    """The first run of the episodes, and the speed of the fastest of several runs."""
     with _opened(source) as loop:
         loop.run(0, source.tests(0, min(CELLS, n_episodes)))  # compiles, and constructs for every cell
         tests = source.tests(0, n_episodes)
@@ -147,7 +147,7 @@ def _timed_run(source: Source, n_episodes: int) -> tuple[Shard, Speed]:
 
 
 def _run_in_another_order(source: Source, n_episodes: int) -> dict[int, Bits]:
-    """What every episode leaves when it is run in another cell, the second half first; a user's code elsewhere."""
+    """Results of every episode run in another cell, the second half first; a user's code in a fresh process."""
     half = n_episodes // 2
     order = [*range(half, n_episodes), *range(half)]
     parts = order[: n_episodes - half], order[n_episodes - half :]
@@ -161,7 +161,7 @@ def _run_in_another_order(source: Source, n_episodes: int) -> dict[int, Bits]:
 
 
 def _moved_by_warm_up(source: Source, n: int) -> dict[float, float]:
-    """By how much (m/s²) first answers move at most, by the length of the warm-up (s); empty where there is none."""
+    """Largest change of first answers (m/s²), by another length of the warm-up (s); empty for an AV without one."""
     av = source.campaign.av
     if not av.warm_up_steps:
         return {}
@@ -183,12 +183,12 @@ def _first_answers(source: Source, av: AutomatedVehicle, n: int) -> dict[int, fl
 
 
 def _likely_cause(source: Source, episode: int) -> tuple[Cause | None, Sequence[str]]:
-    """Why an episode is not the same again, by what it takes; and where a clock was read, if it is that."""
+    """Why an episode is not the same again, by what brings that about; and where a clock was read, if that is it."""
 
     def bits_after(before: Sequence[int]) -> Bits:
         with _opened(source, 1) as loop:
-            for each in before:
-                loop.run(each, source.tests(each, 1))
+            for earlier in before:
+                loop.run(earlier, source.tests(earlier, 1))
             return bits_of(loop.run(episode, source.tests(episode, 1)), 0)
 
     if has_foreign_code(source.campaign.av):
@@ -210,8 +210,8 @@ def _likely_cause(source: Source, episode: int) -> tuple[Cause | None, Sequence[
 
 
 def _follows(shard: Shard) -> Follows:
-    """Behind the vehicle ahead, which is the first of the scenario's."""
-    headways, gaps, faster, n_hit = [], [], [], 0
+    """How the AV follows the vehicle ahead, the first of the scenario's, until the onset."""
+    headways, gaps, closing_speeds, n_hit = [], [], [], 0
     for row, trace in shard.traces.items():
         onset = int(shard.episode["onset_step"][row])
         until = min(onset if onset >= 0 else len(trace) - 1, len(trace) - 1)
@@ -220,25 +220,26 @@ def _follows(shard: Shard) -> Follows:
         n_hit += bool(shard.episode["outcome"][row] == CRASH and until == len(trace) - 1)
         if trace[until, -1, 1] > 0.0:
             headways.append(float(gap[-1] / trace[until, -1, 1]))
-        faster.append(float(trace[until, -1, 1] - trace[until, 0, 1]))
-    headway, speed = (float(np.median(each or [math.nan])) for each in (headways, faster))
+        closing_speeds.append(float(trace[until, -1, 1] - trace[until, 0, 1]))
+    headway, speed = (float(np.median(values or [math.nan])) for values in (headways, closing_speeds))
     return Follows(headway, min(gaps, default=math.nan), speed, n_hit)
 
 
 def _behaviour(shard: Shard, limits: tuple[float, float], *, early: bool) -> Behaviour:
+    """What the AV does after the event; ``early``, from the start."""
     episode, took_over = shard.episode, shard.episode["took_over_step"]
     acted, reactions = [], []
     for row, trace in sorted(shard.traces.items()):
-        cut, onset = int(episode["event_step"][row]), int(episode["onset_step"][row])
+        event, onset = int(episode["event_step"][row]), int(episode["onset_step"][row])
         if episode["outcome"][row] == FAILED:
             continue
         commanded = trace[:-1, -1, 2]  # the last row commands nothing
-        if early or cut >= 0:
+        if early or event >= 0:
             acted.append(commanded[0 if early else onset + 1 :])
-        if cut >= 0:
+        if event >= 0:
             braking = np.flatnonzero(commanded[onset + 1 :] < BRAKING_MPS2)
             reactions.append(float(braking[0]) * STEP_S if braking.size else np.inf)
-    a = np.concatenate(acted) if any(each.size for each in acted) else np.array([np.nan])
+    a = np.concatenate(acted) if any(part.size for part in acted) else np.array([np.nan])
     reaction = np.array(reactions)
     braked = np.isfinite(reaction)
     return Behaviour(

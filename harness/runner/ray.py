@@ -46,7 +46,7 @@ Files = Mapping[str, ray.ObjectRef]
 
 
 def this_machine(resolved: Resolved, controller_sha256: str | None) -> dict[str, str | None]:
-    """What must be equal on all machines."""
+    """Versions and hashes of sources, which must be equal on all machines."""
     packages = ["harness", *(["libsumo"] if resolved.campaign.world.engine == "sumo" else [])]
     versions = {package: metadata.version(package) for package in packages}
     sources = {"sources of its kernels": source_hash(), "source of the controller": controller_sha256}
@@ -54,7 +54,7 @@ def this_machine(resolved: Resolved, controller_sha256: str | None) -> dict[str,
 
 
 class OnMachine:
-    """An actor: it runs shards in a worker process beside it; whatever goes wrong is the run's to judge."""
+    """An actor: it runs shards in a worker process beside it, and returns errors, which the run judges."""
 
     def __init__(self, resolved: Resolved) -> None:
         self._resolved = resolved
@@ -63,7 +63,7 @@ class OnMachine:
         self._follows = False
 
     def begin(self, cached: Files) -> dict[str, str | None] | Exception:
-        """Fill the cache, and say what there is."""
+        """Fill the cache; returns `this_machine`."""
         try:
             for name, content in cached.items():
                 if cache.find(name) is None:
@@ -98,13 +98,13 @@ class OnMachine:
 
 
 class RayWorker:
-    """An actor, seen from the run as a `Child`; ``pending`` is what it is asked for."""
+    """An actor, as the run's counterpart of a `Child`; ``pending`` is its answer to come."""
 
     def __init__(self, actor: Any, pending: ray.ObjectRef[Any], workers: RayWorkers) -> None:
         self._actor, self.pending, self._workers = actor, pending, workers
 
     def give(self, *work: Any) -> bool:
-        # That it is dead shows in its answer.
+        # If the actor is dead, its answer says so.
         self.pending = self._actor.run.remote(work, self._workers.baseline)
         return True
 
@@ -113,11 +113,11 @@ class RayWorker:
         if isinstance(answer, WorkerDeath):
             self._workers.ready.append(self)  # its actor lives, and will start another process
         elif answer is None:
-            self.kill()  # it may live, where it cannot be reached
+            self.kill()  # it may still run where it cannot be reached
         return answer or WorkerDeath(None, None)
 
     def result(self) -> Any:
-        """What it was asked for; None if it is lost."""
+        """The pending answer; None if the actor is lost."""
         try:
             result = ray.get(self.pending)
         except (RayTaskError, RuntimeEnvSetupError):
@@ -140,7 +140,7 @@ class RayWorker:
 
 
 class RayWorkers(Workers):
-    """Starts an actor for each worker, as far as the cluster has room, and others for those that it loses.
+    """Starts an actor for each worker, as far as the cluster has room, and another for each that is lost.
 
     ``n_runs`` such runs share the machines: their workers take turns. Raises a `HarnessError` where there is no such
     cluster, or no room in it for one worker.
@@ -165,14 +165,11 @@ class RayWorkers(Workers):
         self._here = this_machine(resolved, resolved.controller_sha256)
         self._lost_at_start = 0
         self.baseline: list[ray.ObjectRef[bytes]] = []
-        """Baseline runs, once they have all been made."""
+        """Baseline runs, once all are made."""
         self._content = ray.put(resolved)
-        names = source_of(resolved.campaign).cached_files(resolved)
-        self._cached = (
-            {}
-            if address == LOCAL
-            else {name: ray.put(np.frombuffer(kept, np.uint8)) for name in names if (kept := cache.read(name))}
-        )
+        names = [] if address == LOCAL else source_of(resolved.campaign).cached_files(resolved)
+        files = {name: cache.read(name) for name in names}
+        self._cached = {name: ray.put(np.frombuffer(file, np.uint8)) for name, file in files.items() if file}
         self._actor_class = ray.remote(OnMachine).options(
             num_cpus=settings.resources.cpus / n_runs,
             num_gpus=settings.resources.gpus / n_runs,
@@ -191,7 +188,7 @@ class RayWorkers(Workers):
     def first_to_answer(self, busy: Sequence[RayWorker]) -> RayWorker | None:
         pending = {worker.pending: worker for worker in [*busy, *self._starting]}
         while not (answered := ray.wait(list(pending), num_returns=1, timeout=LOOK_S)[0]):
-            pass  # so that signals are handled
+            pass  # between waits, signals are handled
         worker = pending[answered[0]]
         if worker not in self._starting:
             return worker
@@ -201,10 +198,10 @@ class RayWorkers(Workers):
 
     def _admit(self, worker: RayWorker) -> None:
         try:
-            made_of = worker.result()
+            machine = worker.result()
         except RuntimeEnvSetupError as error:
             raise _wrong_environment(error) from error
-        if made_of is None:
+        if machine is None:
             self._lost_at_start += 1
             if self._lost_at_start == STARTS:
                 found, expected = f"{STARTS} workers in a row, lost while they began", "machines on which it starts"
@@ -212,7 +209,7 @@ class RayWorkers(Workers):
                 raise WorkerLostError("run.executor", found, expected, mend)
             return
         for what, here in self._here.items():
-            if (there := made_of.get(what)) != here:
+            if (there := machine.get(what)) != here:
                 expected = f"{here}, as here: all must run the same code"
                 mend = "Install the same versions everywhere; bring a controller along in run.ray.runtime_env "
                 mend += "(working_dir), or install its package on all machines."
@@ -265,15 +262,13 @@ def _require_answer(address: str) -> None:
 
 
 def _room(settings: RaySettings) -> int:
-    have, want = ray.cluster_resources(), settings.resources
-    room = [have.get(name, 0.0) / n for name, n in (("CPU", want.cpus), ("GPU", want.gpus)) if n > 0.0]
+    """Workers that the cluster has room for."""
+    wanted = settings.resources
+    cpus, gpus = (float(ray.cluster_resources().get(name, 0.0)) for name in ("CPU", "GPU"))
+    room = [have / want for have, want in ((cpus, wanted.cpus), (gpus, wanted.gpus)) if want > 0.0]
     n = int(min(room, default=float(usable_cpus())))
     if n == 0:
-        expected = f"room for one worker: {want.cpus:g} CPUs and {want.gpus:g} GPUs on one machine"
+        expected = f"room for one worker: {wanted.cpus:g} CPUs and {wanted.gpus:g} GPUs on one machine"
         mend = "Ask for less, or give --workers if machines are to come later."
-        raise HarnessError("run.ray.resources", f"a cluster of {_words(have)}", expected, mend)
+        raise HarnessError("run.ray.resources", f"a cluster of {cpus:g} CPUs and {gpus:g} GPUs", expected, mend)
     return n
-
-
-def _words(resources: Mapping[str, float]) -> str:
-    return f"{resources.get('CPU', 0.0):g} CPUs and {resources.get('GPU', 0.0):g} GPUs"

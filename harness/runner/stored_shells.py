@@ -134,8 +134,7 @@ class StoredShells:
         """Tests with their weights in ``traffic``, where each path's events change as those of all paths together."""
         if self.is_same:
             return block
-        old, new = self.tested.cell_p, self.design.cell_p
-        times = np.divide(new, old, out=np.zeros_like(new), where=old > 0.0)
+        times = ratio_of(self.design.cell_p, self.tested.cell_p, of_nothing=0.0)
         columns = {**block.columns, "cell_mass": block.cell_mass * times}
         with np.errstate(divide="ignore"):
             log_weight = np.log(self.design.p[block.stratum])
@@ -164,7 +163,9 @@ class StoredShells:
             references = ratio_of(other.references, base.references)
             crashing = new_p * crash_share
             # The pool's events are a sample: some of the same traffic lie beyond it, too, and do not count.
-            more_beyond = _share(other.beyond, other.p) - _share(base.beyond, base.p)
+            more_beyond = ratio_of(other.beyond, other.p, of_nothing=0.0) - ratio_of(
+                base.beyond, base.p, of_nothing=0.0
+            )
             with np.errstate(divide="ignore", over="ignore", invalid="ignore"):
                 off = np.expm1(np.abs(np.log(ratio_of(new_p @ shares, p @ shares) / references)))
                 beyond = float(
@@ -234,10 +235,6 @@ def moved_to(tested: StoredShells, there: Resolved, name: str, progress: Progres
     return moved
 
 
-def _share(part: FloatArray, whole: FloatArray) -> FloatArray:
-    return np.divide(part, whole, out=np.zeros_like(whole), where=whole > 0.0)
-
-
 def require_shares(tested: StoredShells) -> None:
     """Raise a `CampaignError` where shares may not be taken to stay the same."""
     if tested.holds:
@@ -276,7 +273,7 @@ def reference_shares(design: ShellDesign) -> FloatArray:
     """Share of each stratum on which each reference driver crashes, shape (S, R)."""
     crashes_too = np.array([design.crashes_too(r) for r in range(len(design.references))])
     crashing = design.joined.T @ (design.cell_p * crashes_too.reshape(-1, design.cell_p.size)).T
-    return _share(crashing, np.broadcast_to(design.p[:, None], crashing.shape))
+    return ratio_of(crashing, np.broadcast_to(design.p[:, None], crashing.shape), of_nothing=0.0)
 
 
 def _share_beyond(tested: StoredShells, new: Pool) -> float:

@@ -59,8 +59,8 @@ class StoredRun(ShownInPython):
         return StoredEstimates(self.estimates, self.folder)._lines()
 
     def _plot(self) -> Plot | None:
-        found = (self.folder / ESTIMATES).is_file()
-        return StoredEstimates(self.estimates, self.folder)._plot() if found else None
+        has_answer = (self.folder / ESTIMATES).is_file()
+        return StoredEstimates(self.estimates, self.folder)._plot() if has_answer else None
 
     @checked("episodes")
     def episodes(self, columns: Sequence[str] | None = None) -> pd.DataFrame:
@@ -83,7 +83,7 @@ class StoredRun(ShownInPython):
 
     @checked("table")
     def table(self, name: TableName, columns: Sequence[str] | None = None) -> pa.Table:
-        """What the method of that ``name`` gives, as an Arrow table: several times faster, and smaller, for long runs.
+        """Content of the method of that ``name``, as an Arrow table: several times faster and smaller for long runs.
 
         Unit and meaning of a column are in its field's metadata.
         """
@@ -103,23 +103,23 @@ class StoredRun(ShownInPython):
             mend = f"Run it into another folder with --set records.{name}=all."
             raise RunFolderError(str(self.folder), f"no {name}", f"a run whose campaign kept {name}", mend)
         read = partial(read_kept, self.folder, table=name)
-        made, of = ((_WEIGHT.name,), ("log_weight", "component")) if name == "episodes" else ((), ())
-        kept = read(parts[0]).column_names
-        shown = list(dict.fromkeys([*(kept if columns is None else columns), *made]))
-        needed = [column for column in dict.fromkeys([*shown, *of]) if column not in made]
-        if unknown := sorted({*needed} - {*kept}):
+        added, needs = ((_WEIGHT.name,), ("log_weight", "component")) if name == "episodes" else ((), ())
+        stored = read(parts[0]).column_names
+        shown = list(dict.fromkeys([*(stored if columns is None else columns), *added]))
+        needed = [column for column in dict.fromkeys([*shown, *needs]) if column not in added]
+        if unknown := sorted({*needed} - {*stored}):
             found = f"no column {unknown[0]!r} in {name}"
-            raise RunFolderError(str(self.folder), found, f"one of {', '.join(sorted(kept))}", "Correct its name.")
+            raise RunFolderError(str(self.folder), found, f"one of {', '.join(sorted(stored))}", "Correct its name.")
         per_shell = None
-        if made and (self.folder / SHELLS).is_file():
+        if added and (self.folder / SHELLS).is_file():
             components = (read(part, columns=["component"])["component"] for part in parts)
             per_shell = np.sum([np.bincount(shells, minlength=_MOST_SHELLS) for shells in components], axis=0)
         for piece in made_ahead(partial(read, columns=needed), parts, N_READERS):
-            yield (piece.append_column(_WEIGHT, _weights(piece, per_shell)) if made else piece).select(shown)
+            yield (piece.append_column(_WEIGHT, _weights(piece, per_shell)) if added else piece).select(shown)
 
 
 def _weights(episodes: pa.Table, per_shell: IntArray | None) -> pa.Array:
-    """Weights of tests, of which there are so many ``per_shell``; None where they are not drawn from shells."""
+    """Weights of tests; ``per_shell`` (S,) are the run's tests of each shell, None without shells."""
     # The weight of a failed test, which counts as no crash, may be unknown.
     log_weight = episodes["log_weight"].to_numpy()
     weight = np.exp(np.where(np.isnan(log_weight), 0.0, log_weight))
@@ -129,7 +129,7 @@ def _weights(episodes: pa.Table, per_shell: IntArray | None) -> pa.Array:
 
 
 def _described(table: pa.Table) -> pd.DataFrame:
-    """A table as a frame, with what Arrow's field metadata says of its columns."""
+    """A table as a frame, with unit and doc of its columns from Arrow's field metadata."""
     frame: pd.DataFrame = table.to_pandas()
     for key in ("unit", "doc"):
         frame.attrs[key] = {field.name: field.metadata[key.encode()].decode() for field in table.schema}

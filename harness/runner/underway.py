@@ -164,10 +164,9 @@ class Underway:
 
     def drive_added(self, tested: IntArray, added: IntArray, rule: Rule) -> Iterator[ShardResult]:
         """Drive ``added`` more tests per stratum, (S,), after the ``tested`` ones, (S,); yields their shards."""
-        if not added.any():
-            return self.drive((), rule)
-        run, smallest = self.run, self.run.resolved.campaign.run.smallest_shard
-        return self.drive(round_requests(tested, added, len(run.blocks), run.n_episodes, smallest), rule)
+        run, size = self.run, self.run.resolved.campaign.run.smallest_shard
+        requests = round_requests(tested, added, len(run.blocks), run.n_episodes, size) if added.any() else ()
+        return self.drive(requests, rule)
 
     def require_tests(self) -> None:
         """Refuse (`HarnessError`) a run without tests, with too many that failed, or fewer than the folder had."""

@@ -1,6 +1,6 @@
-"""Workers that run shards, whose results are handed back in order; what happens to the shard of one that dies.
+"""Workers that run shards and hand their results back in order; what happens to the shard of a worker that dies.
 
-Here workers are processes of this machine; `harness.runner.ray` makes those of a cluster.
+Here workers are processes of this machine; `harness.runner.ray` has those of a cluster.
 """
 
 from __future__ import annotations
@@ -34,26 +34,26 @@ from harness.sampling.protocol import ShardRequest
 from harness.worlds import build_world
 
 ATTEMPTS = 3
-"""A shard whose worker dies is given to another one, this many times in all."""
+"""Workers that a shard is given to, one after the other, if they die."""
 SURELY_TOO_MANY = 1e-4
-"""Probability of so many deaths under the allowed share, below which a controller is refused: with the default share
-its third at the earliest, its seventh if it dies in all of 96 cells, some ten seconds into the run."""
+"""A controller is refused where so many deaths are less probable than this under the allowed share: with the default
+share at its third at the earliest, at its seventh if it dies in all of 96 cells, some ten seconds into the run."""
 SENT_FROM_OUTSIDE = (-signal.SIGKILL, -signal.SIGTERM, None)
-"""Ends that an operator or a shortage of memory brings: a controller is blamed only when its test is hit again."""
+"""Exit codes that an operator or a shortage of memory brings: the controller is blamed only if its test dies again."""
 CLOSING_S = 10.0
 """Time that a worker gets to release its controllers once all is done."""
 
 
 @dataclass(frozen=True)
 class ShardResult:
-    """A finished shard: its tables, and what the stop rule and estimates need of them; a new one is not on disk."""
+    """A finished shard: its tables, and the block that estimates are made from; ``is_new`` if it is not yet on disk."""
 
     request: ShardRequest
     tables: Tables
     block: Block
     is_new: bool = True
     repeated: Repeated | None = None
-    """What tests have shown that were run twice, of a shard where `is_repeated`."""
+    """How many of its tests were run twice, and which differed, if it is a shard where `is_repeated`."""
 
 
 Result = ShardResult | BaselineResult
@@ -62,7 +62,7 @@ _Result = TypeVar("_Result", bound=Result)
 
 
 def serve(connection: Connection, resolved: Resolved, baseline: Path) -> None:
-    """Run shards until the parent has no more; the file ``baseline`` holds what tests follow from, if anything."""
+    """Run shards until the parent has no more; ``baseline`` is the file of baseline runs, if tests follow from some."""
     runner: ShardRunner | None = None
 
     def run(request: ShardRequest, fatal: Mapping[int, str], alone: bool) -> Result:
@@ -81,10 +81,11 @@ def serve(connection: Connection, resolved: Resolved, baseline: Path) -> None:
 
 
 class ShardRunner:
-    """Runs shards of one campaign in one world; with a ``connection`` test by test, each told as it begins."""
+    """Runs shards of one campaign in one world; with a ``connection`` one test at a time, telling it which begins."""
 
     def __init__(self, resolved: Resolved, baseline: Path, connection: Connection | None = None) -> None:
-        self._connection, self.alone, self._fatal = connection, connection is not None, dict[int, str]()
+        self._connection, self.alone = connection, connection is not None
+        self._fatal: dict[int, str] = {}
         self._baseline = baseline
         self._source = prepare(resolved)
         self._begun = False
@@ -113,12 +114,13 @@ class ShardRunner:
             self._begun = True
             source.begin_after(as_recorded(read_table(self._baseline), source.scenario.max_steps))
             self._loop = self._loop.beside()
-        campaign, shard = source.campaign, source.run(self._loop, request)
+        campaign = source.campaign
+        shard = source.run(self._loop, request)
         keep_traces = campaign.records.traces != "none" or campaign.records.trace_share > 0.0
         tables = shard_tables(shard, campaign.seed, keep_traces=keep_traces)
-        # A vehicle must show that it does the same again: built-in models do, and outside programs need not.
-        shows = is_repeated(request) and campaign.av.model is None and campaign.av.traci is None
-        repeated = repeat(self._loop, source, shard) if shows else None
+        # Built-in models always do the same again, and outside programs need not.
+        checked = is_repeated(request) and campaign.av.model is None and campaign.av.traci is None
+        repeated = repeat(self._loop, source, shard) if checked else None
         return ShardResult(request, tables, source.block(tables), repeated=repeated)
 
 
@@ -130,9 +132,9 @@ class WorkerLostError(HarnessError):
 
 @dataclass
 class _Job:
-    """A shard that is wanted, with its result once there is one.
+    """A requested shard, with its result once there is one.
 
-    After a worker's death its tests are run one at a time (``alone``), and those that are ``fatal`` not at all.
+    After a worker's death its tests are run one at a time (``alone``); those that are ``fatal`` are not run at all.
     """
 
     request: ShardRequest
@@ -144,14 +146,14 @@ class _Job:
 
 
 class Workers:
-    """``n_workers`` at most; one that dies takes nothing but its unfinished shard along.
+    """At most ``n_workers``; when one dies, only its unfinished shard is lost.
 
-    Everything happens in the caller's thread, and no two workers share anything. So there is no lock that a killed one
+    Everything happens in the caller's thread, and no two workers share anything: there is no lock that a killed one
     could keep, and no queue that Ctrl-C could leave half filled.
     """
 
     where = ""
-    """Said of the workers where their work is shown; empty for this machine."""
+    """Where they are, for the progress display; empty for this machine."""
 
     def __init__(self, resolved: Resolved, n_workers: int) -> None:
         self._campaign, self.n_workers = resolved.campaign, n_workers
@@ -163,7 +165,7 @@ class Workers:
         raise NotImplementedError
 
     def close(self) -> None:
-        """Stop all workers, finished or not; those that are idle may release their controllers first."""
+        """Stop all workers, finished or not; idle ones may release their controllers first."""
         for worker in self._busy:
             worker.kill()
         for worker in self._idle:
@@ -175,25 +177,25 @@ class Workers:
     def run(
         self, requests: Iterator[ShardRequest], known: Callable[[ShardRequest], _Result | None]
     ) -> Iterator[_Result]:
-        """Results in the order of the requests; shards that are ``known`` are not run again.
+        """Results in the order of the requests; shards whose result is ``known`` are not run again.
 
-        Two shards per worker are under way or wait for their turn to be handed back: little is lost at the stop, and
-        little is held in memory. Raises a `WorkerLostError` when workers died `ATTEMPTS` times on the same shard.
+        Two shards per worker are under way, or finished and waiting for their turn: so little is lost at the stop, and
+        little is held in memory. Raises `WorkerLostError`: workers died `ATTEMPTS` times on the same shard.
         """
-        wanted: deque[_Job] = deque()
+        in_order: deque[_Job] = deque()
         waiting: deque[_Job] = deque()
         while True:
-            for request in islice(requests, 2 * self.n_workers + 1 - len(wanted)):
-                wanted.append(_Job(request, known(request)))
-                if wanted[-1].result is None:
-                    waiting.append(wanted[-1])
-            if not wanted:
+            for request in islice(requests, 2 * self.n_workers + 1 - len(in_order)):
+                in_order.append(_Job(request, known(request)))
+                if in_order[-1].result is None:
+                    waiting.append(in_order[-1])
+            if not in_order:
                 return
             self._hand_out(waiting)
-            while wanted[0].result is None:
+            while in_order[0].result is None:
                 self._collect(waiting)
                 self._hand_out(waiting)
-            yield wanted.popleft().result  # type: ignore[misc]
+            yield in_order.popleft().result  # type: ignore[misc]
 
     def new_worker(self) -> Any:
         """Another worker beside those that are busy; None as long as none is ready."""
@@ -204,7 +206,7 @@ class Workers:
         raise NotImplementedError
 
     def _hand_out(self, waiting: deque[_Job]) -> None:
-        """Give waiting shards to idle workers, of which there may be up to as many as were asked for."""
+        """Give waiting shards to idle workers, and start new ones up to ``n_workers``."""
         while waiting and len(self._busy) < self.n_workers:
             worker = self._idle.pop() if self._idle else self.new_worker()
             if worker is None:
@@ -215,6 +217,7 @@ class Workers:
                 worker.kill()  # it died while it was idle
 
     def _collect(self, waiting: deque[_Job]) -> None:
+        """Take the next answer of a busy worker; the shard of one that died waits again."""
         worker = self.first_to_answer(list(self._busy))
         if worker is None:
             return
@@ -228,7 +231,7 @@ class Workers:
             self._idle.append(worker)
 
     def _blame(self, job: _Job, death: WorkerDeath) -> None:
-        """Say whose doing the death of a worker was: a test's that is run no more, or nobody's knows."""
+        """Find out which test ended a worker, which is then run no more; give up where that remains unknown."""
         exit_code, episode = death
         again = episode is not None and episode == job.suspected
         if episode is not None and episode not in job.fatal and (again or exit_code not in SENT_FROM_OUTSIDE):
@@ -250,7 +253,7 @@ class Workers:
         raise WorkerLostError(where, found, "a worker that finishes the shard", mend)
 
     def _require_few_deaths(self, job: _Job) -> None:
-        """Each death costs a new process: a controller that dies too often is not run to the end of its shard."""
+        """Refuse (`TooManyFailedError`) a controller that dies too often: each death costs a new process."""
         share, fatal = self._campaign.run.max_failed_share, job.fatal
         episode, cause = next(reversed(fatal.items()))
         n_begun = max(fatal) - job.request.first_episode + 1

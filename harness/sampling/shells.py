@@ -194,11 +194,7 @@ class Allocation:
         tests = tally.tests
         if self._used_up(tally):
             return np.zeros_like(tests)
-
-        def of_crashes(n: int) -> float:
-            return combined(self.p[:n], tally.part(slice(0, n)), self.n_paths, LEVEL).rhw
-
-        begun = np.arange(tests.size) < self._n_begun(tests, inner_rhw or of_crashes)
+        begun = np.arange(tests.size) < self._n_begun(tally, inner_rhw)
         active = begun & (tests < self.available)
         wanted = np.where(active, np.maximum(self.first_tests - tests, 0), 0)
         if wanted.any():
@@ -221,13 +217,16 @@ class Allocation:
         squares = np.where(relevant, (self.p * (high - low)) ** 2, 0.0)
         return bool(squares[tests >= self.available].sum() >= USED_UP_SHARE * squares.sum())
 
-    def _n_begun(self, tests: IntArray, inner_rhw: Callable[[int], float]) -> int:
+    def _n_begun(self, tally: Tally, inner_rhw: Callable[[int], float] | None) -> int:
         """Number of strata that are tested now: those inside the boundary alone, while they leave much open."""
-        n = min(self.n_inside, self.n_asked)
+        n, tests = min(self.n_inside, self.n_asked), tally.tests
         enough = n == self.n_asked or np.any(tests[n:] > 0) or np.all(tests[:n] >= self.available[:n])
         # Without this end a vehicle that crashes rarely inside, and often outside, would not be tested outside at all.
         enough = enough or tests[:n].sum() >= MOST_INNER_TESTS * self.first_tests[:n].sum()
-        return self.n_asked if enough or inner_rhw(n) <= INNER_RHW else n
+        if enough:
+            return self.n_asked
+        rhw = inner_rhw(n) if inner_rhw else combined(self.p[:n], tally.part(slice(0, n)), self.n_paths, LEVEL).rhw
+        return self.n_asked if rhw <= INNER_RHW else n
 
     def _spread(self, tally: Tally, size: int, room: IntArray) -> IntArray:
         """Divide ``size`` tests among strata with ``room`` (S,) to where they narrow the crash rate most, (S,)."""
