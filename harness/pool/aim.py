@@ -66,8 +66,7 @@ def fit_proposal(u: FloatArray, contribution: FloatArray) -> FloatArray:
     for d in range(u.shape[1]):
         bins = _bin_of(u[:, d])
         counts = np.bincount(bins, minlength=N_BINS)
-        squares = np.bincount(bins, contribution * contribution, minlength=N_BINS) / np.maximum(counts, 1)
-        root = np.sqrt(squares)
+        root = np.sqrt(np.bincount(bins, contribution * contribution, minlength=N_BINS) / np.maximum(counts, 1))
         smooth = np.convolve(np.concatenate([root[:1], root, root[-1:]]), [0.25, 0.5, 0.25], "valid")
         if smooth.sum() > 0.0:
             density[d] = smooth * (N_BINS / smooth.sum())
@@ -106,11 +105,9 @@ class EnumeratedPaths:
 
     def rates(self, n_surrogates: int) -> FloatArray:
         """Weighted probability on each path that each surrogate crashes, and of an event; shape (n, D + 1)."""
-
-        def rate(surrogate: int) -> FloatArray:
-            return np.asarray(np.where(self.crashes & (1 << surrogate), self.mass, 0.0).sum(1))
-
-        return np.column_stack([*made_ahead(rate, range(n_surrogates)), self.mass.sum(1)])
+        bits = [1 << surrogate for surrogate in range(n_surrogates)]
+        rates = made_ahead(lambda bit: np.where(self.crashes & bit, self.mass, 0.0).sum(1), bits)
+        return np.column_stack([*rates, self.mass.sum(1)])
 
 
 @dataclass(frozen=True, eq=False)

@@ -78,11 +78,8 @@ def campaign_pool(resolved: Resolved, progress: Progress | None = None, order: S
     if (cached := cached_pool(resolved, order)) is not None:
         return cached
     progress = progress or Progress()
-
-    def waits(who: str) -> None:
-        progress.stage(f"waiting for a pool that another run builds ({who})", None)
-
-    with cache.made_once(pool_name(key), waits):
+    waiting = "waiting for a pool that another run builds"
+    with cache.made_once(pool_name(key), lambda builder: progress.stage(f"{waiting} ({builder})", None)):
         if (cached := cached_pool(resolved, order)) is not None:
             return cached
         pool = build_pool(resolved, key, progress, order)
@@ -164,11 +161,9 @@ def pool_of(resolved: Resolved, paths: EnumeratedPaths, key: str, order: IntArra
     rates, mass = paths.rates(n_surrogates), paths.mass
     order = conservative_first(rates) if order is None else order
     n, ordered = len(rates), rates[:, order]
-
     shell, references = shells_of(paths.crashes, order), paths.crashes >> n_surrogates
     cell, cell_shell, cell_references, by_path = cells_of(mass, shell, references, n_references)
     by_reference = by_path @ ((cell_references[:, None] >> np.arange(n_references)) & 1)
-
     n_within = list(names[order]).index(library.boundary) + 1
     times = np.where(np.arange(n_surrogates + 1) < n_within, 1, family.outside_kept)
     path, step = _sample(mass, shell, (settings.events_per_shell * times).tolist(), settings.seed)

@@ -136,16 +136,12 @@ class Pool:
         references = zip(self.library.references, self.reference_rate.tolist(), reference_error.tolist(), strict=True)
         keys = "name", "crash_rate", "std_error", "shell_probability"
         return {
-            "pool": self.key,
-            "n_paths": self.n_paths,
-            "p_event": self.p_event,
-            "p_event_std_error": self.p_event_se,
-            "boundary": self.library.boundary,
-            "envelope": self.library.envelope,
+            "pool": self.key, "n_paths": self.n_paths, "p_event": self.p_event, "p_event_std_error": self.p_event_se,
+            "boundary": self.library.boundary, "envelope": self.library.envelope,
             "surrogates": [dict(zip(keys, row, strict=True)) for row in surrogates],
             "no_surrogate_crashes": p[-1],
             "references": [dict(zip(keys[:-1], row, strict=True)) for row in references],
-        }
+        }  # fmt: skip
 
 
 def pool_content(pool: Pool) -> bytes:

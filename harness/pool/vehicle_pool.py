@@ -142,9 +142,8 @@ def vehicle_pool(resolved: Resolved, paths: BaselinePaths, runs: Recorded) -> Po
     if not events.crashes.any():
         failed = f" ({n:,} of them failed)" if (n := int(runs.failed.sum())) else ""
         found = f"no event on {len(paths):,} paths{failed} after which even the most careless surrogate would crash"
-        mend = (
-            "Raise pool.shadow_paths, use testing.method forced, or see whether the vehicle moves (`harness av-check`)."
-        )
+        mend = "Raise pool.shadow_paths, use testing.method forced, or see whether the vehicle moves "
+        mend += "(`harness av-check`)."
         raise HarnessError("baseline runs", found, "some: the crash rate is estimated from them", mend)
     mass = events.probability * paths.weight[:, None]
     enumerated = EnumeratedPaths(paths.index, paths.start, paths.weight, mass, events.crashes)

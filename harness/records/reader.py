@@ -228,10 +228,8 @@ def hardest_crash(folder: Path) -> tuple[Path, int]:
 
     Raises `RunFolderError`: there is no crash.
     """
-    runs = [folder]
-    if (folder / FAMILIES).is_file():
-        runs = [manifest.parent for manifest in sorted(folder.glob("*/manifest.json"))]
-    crashes = list[tuple[float, int, Path]]()
+    several, crashes = (folder / FAMILIES).is_file(), list[tuple[float, int, Path]]()
+    runs = [manifest.parent for manifest in sorted(folder.glob("*/manifest.json"))] if several else [folder]
     for run in runs:
         if not (parts := read_manifest(run)["parts"]):
             raise no_episodes(run)

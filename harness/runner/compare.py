@@ -232,14 +232,12 @@ def _sum_written(
         answers = {name: (run.estimates, run.manifest) for name, run in shown.items()}
         families = [OfFamily(each.name, each.exposure, each.tests_of_pairs(i)) for each in scenarios]
         sides[side] = hour_answer(PerHour(families), ready, answers, confidence)
+    contrasts = {scenario.name: contrast(together([scenario], campaign), level) for scenario in scenarios}
     content = finite_json({
         "format": 1, "method": campaign.testing.method, "seed": campaign.seed, "exposure": campaign.exposure,
         "campaigns": {side: {"label": label} for side, label in zip(SIDES, labels, strict=True)},
         **sides, **contrast(pairs, level), **ended, "confidence": confidence,
-        "families": {
-            each.name: {**contrast(together([each], campaign), level), "decision": decisions[each.name]}
-            for each in scenarios
-        },
+        "families": {name: {**own, "decision": decisions[name]} for name, own in contrasts.items()},
     })  # fmt: skip
     write_sealed(out / COMPARISON, content)
     runs = [result.shown for scenario in scenarios for result in scenario.results]

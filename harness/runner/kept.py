@@ -198,8 +198,8 @@ class Run:
     def require_no_fewer(self) -> None:
         """Refuse (`RunFolderError`) a stop rule that ends before the finished tests: some would be thrown away."""
         if self.is_behind:
-            held, n = self.earlier.n_episodes, self.n_episodes
-            found = f"{held:,} finished tests, of which the campaign as it is asked for now would keep {n:,}"
+            n, n_kept = self.earlier.n_episodes, self.n_episodes
+            found = f"{n:,} finished tests, of which the campaign as it is asked for now would keep {n_kept:,}"
             expected = "a stop rule (stop.rhw, stop.episodes) that needs at least the tests that are there"
             mend = f"Ask for more, or repeat its --set options; `harness estimate {self.folder}` reads what is there."
             raise RunFolderError(str(self.folder), found, expected, mend)

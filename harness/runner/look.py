@@ -95,9 +95,8 @@ def check_av(campaign: Campaign | str | Path, n_episodes: AtLeastTwo = EPISODES)
 def _as_checked(campaign: Campaign) -> Campaign:
     """The campaign with cut-ins in (nearly) every episode, all motion kept, and the twin where it can drive the AV."""
     holds = campaign.av.before_event == "hold_speed"
-    method = "forced" if holds else "step_mixture"
     environment = campaign.environment if holds else campaign.environment.replaced(("cut_in_lead_s",), 0.0)
-    testing = campaign.testing.model_copy(update={"method": method})
+    testing = campaign.testing.model_copy(update={"method": "forced" if holds else "step_mixture"})
     engine = "sumo" if campaign.av.source in ("sumo", "traci") else "twin"
     world = campaign.world.model_copy(update={"engine": engine, "cells": CELLS})
     records = campaign.records.model_copy(update={"moments": "none", "traces": "all"})

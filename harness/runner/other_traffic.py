@@ -36,6 +36,9 @@ N_REPLICATES = 50
 CONFIDENCE, QUANTILE = 0.9, 1.645
 _OPTION = "harness sensitivity"
 
+Ranges = Mapping[str, tuple[float, float]]
+"""Lowest and highest value of numbers, by ``section.name``."""
+
 
 @checked("harness.estimate_in_other_traffic")
 def estimate_in_other_traffic(
@@ -105,20 +108,21 @@ def traffic_error(moved: StoredShells, content: Mapping[str, Any], progress: Pro
     n_refused = len(values) - len(replicates)
     factors = np.array([replicate.rate for replicate in replicates])
     off = np.array([replicate.off for replicate in replicates])
-
-    confidence, estimate, held = content["confidence"], content["estimates"]["shells"], moved.holds
+    confidence, estimate, holds = content["confidence"], content["estimates"]["shells"], moved.holds
     interval = estimate["ci_low"], estimate["ci_high"]
-    if not estimate["n_crashes"] or not held:
+    if not estimate["n_crashes"] or not holds:
         interval = 0.0, estimate["upper_bound"]
-    below = unseen is None and held
-    rate = uncertain(estimate["crash_rate"], interval, factors, off, n_refused, confidence, from_below=below, held=held)
+    below = unseen is None and holds
+    rate = uncertain(
+        estimate["crash_rate"], interval, factors, off, n_refused, confidence, from_below=below, held=holds
+    )
     drivers, ratios = [driver.name for driver in moved.design.references], {}
     for beside in estimate["details"]["references"]:
         driver = drivers.index(beside["reference"])
         of_ratio = factors / np.array([replicate.references[driver] for replicate in replicates])
         ends = beside["ratio_low"] or 0.0, math.inf if beside["ratio_high"] is None else beside["ratio_high"]
         ratios[beside["reference"]] = uncertain(
-            beside["ratio"], ends, of_ratio, off + ONE_LAW, n_refused, confidence, from_below=held, held=held
+            beside["ratio"], ends, of_ratio, off + ONE_LAW, n_refused, confidence, from_below=holds, held=holds
         )
     name, mean_off = Path(settings.parameters).stem, float(np.mean(off))
     return TrafficError(name, confidence, len(values), n_refused, mean_off, rate, ratios, unseen)
@@ -152,7 +156,7 @@ class Move:
 
 @checked("harness.sensitivity")
 def sensitivity(
-    folder: str | Path, *, ranges: Mapping[str, tuple[float, float]] | None = None, progress: Progress | None = None
+    folder: str | Path, *, ranges: Ranges | None = None, progress: Progress | None = None
 ) -> dict[str, Any]:
     """Write ``sensitivity.json`` into the folder of a run of shells, and return its content (`Sensitivity`).
 
@@ -175,9 +179,7 @@ def sensitivity(
     return content
 
 
-def _of_one(
-    folder: Path, ranges: Mapping[str, tuple[float, float]], progress: Progress, *, per_event: bool = False
-) -> Sensitivity:
+def _of_one(folder: Path, ranges: Ranges, progress: Progress, *, per_event: bool = False) -> Sensitivity:
     tested = StoredShells.of(folder, progress, _OPTION)
     require_shares(tested)
     settings, parameters = tested.here.campaign.environment, tested.here.parameters
@@ -193,16 +195,17 @@ def _of_one(
     bars = [bar_of(move, [next(results) for _ in move.settings]) for move in all_moves]
     driver = next((reference.name for reference in tested.design.references), "")
     bars += bar_of_readings(tested.design)
-    return Sensitivity(tested.manifest["campaign_hash"], Path(settings.parameters).stem, driver, _longest_first(bars))
+    bars.sort(key=lambda bar: -bar.span)
+    return Sensitivity(tested.manifest["campaign_hash"], Path(settings.parameters).stem, driver, tuple(bars))
 
 
-def _of_sum(folder: Path, ranges: Mapping[str, tuple[float, float]], progress: Progress) -> Sensitivity:
+def _of_sum(folder: Path, ranges: Ranges, progress: Progress) -> Sensitivity:
     """Bars of each scenario, scaled by its share of the sum, and of the exposures; one that refuses has that alone."""
     stored, bars = read_families(folder), list[Bar]()
     if not stored["n_crashes"]:  # the sum's upper limit is no sum of the scenarios' limits: none has a share of it
         mend = f"Ask {folder / next(iter(stored['families']))}, say, or harness estimate with --exposure."
         raise CampaignError(_OPTION, "tests of which none crashed", "crashes, whose rate moves", mend)
-    own_ranges: dict[str, Mapping[str, tuple[float, float]]] = {}
+    own_ranges: dict[str, Ranges] = {}
     for name in stored["families"]:
         campaign = read_campaign(folder / name, read_manifest(folder / name), check_files=True)
         numbers = {key.replace("__", ".") for key in resolve(campaign).parameters.numbers()}
@@ -233,7 +236,8 @@ def _of_sum(folder: Path, ranges: Mapping[str, tuple[float, float]], progress: P
                 what = bar.what if bar.what.startswith(f"{name}.") else f"{name} {bar.what}"
                 bars.append(_part(replace(bar, what=what), *shares))
     progress.remark = ""
-    return Sensitivity(tests_of_sum(stored), "crashes per hour", stored["beside"]["reference"], _longest_first(bars))
+    bars.sort(key=lambda bar: -bar.span)
+    return Sensitivity(tests_of_sum(stored), "crashes per hour", stored["beside"]["reference"], tuple(bars))
 
 
 def _part(bar: Bar, share: float, driver_share: float) -> Bar:
@@ -246,13 +250,7 @@ def _part(bar: Bar, share: float, driver_share: float) -> Bar:
     return replace(bar, rate=(low, high), ratio=(lower, upper), off=(share * bar.off[0], share * bar.off[1]))
 
 
-def _longest_first(bars: Sequence[Bar]) -> tuple[Bar, ...]:
-    return tuple(sorted(bars, key=lambda bar: -bar.span))
-
-
-def moves(
-    name: str, parameters: Parameters, shipped: Path, ranges: Mapping[str, tuple[float, float]]
-) -> Iterator[Move]:
+def moves(name: str, parameters: Parameters, shipped: Path, ranges: Ranges) -> Iterator[Move]:
     """Moves of the uncertain numbers of an environment, which is so named, and of those with given ``ranges``."""
     numbers = parameters.numbers()
     given = {name.replace(".", "__"): ends for name, ends in ranges.items()}
@@ -295,10 +293,7 @@ def bar_of_readings(design: ShellDesign) -> list[Bar]:
 
 
 def bar_of(move: Move, results: Sequence[Nearby | None]) -> Bar:
-    """The bar of a move with the ``results`` of its environments.
-
-    A block's ends are quantiles over those that can be answered; NaN where these are less than half.
-    """
+    """The bar of a move: of a block quantiles of the ``results`` that can be answered, NaN where less than half can."""
     nan = np.full((2, 2), np.nan)
     ends = np.array([nan[0] if each is None or each.refused else (each.rate, each.ratio) for each in results])
     off = np.array([np.nan if each is None else each.off for each in results])

@@ -59,11 +59,6 @@ class PairedScenario:
         """How often its events are met."""
         return exposure_of(self.runs[0].run.resolved, self._exposures)
 
-    @property
-    def tests_per_hour(self) -> float:
-        """Tests that an hour of driving stands for."""
-        return self.exposure.per_hour / self.runs[0].prescribed.design.p_counted
-
     def take_over(self, rule: PairRule) -> None:
         """Add the tests that the folders hold."""
         for side, underway in enumerate(self.runs):
@@ -89,13 +84,8 @@ class PairedScenario:
 def drive_pairs(
     campaign: Campaign, ready: Mapping[Path, Both], rule: PairRule, workers: int | None, progress: Progress
 ) -> tuple[PairRounds, list[PairedScenario]]:
-    """Drive rounds of pairs of A and B until the rule is content; returns the rounds, and each scenario's pairs.
-
-    ``ready`` are both vehicles, by the folder of each scenario.
-    """
-    folders = {
-        folder / side: resolved for folder, both in ready.items() for side, resolved in zip(SIDES, both, strict=True)
-    }
+    """Drive rounds of pairs of A and B, ``ready`` by the folder of each scenario, until the rule is content."""
+    folders = {folder / side: own for folder, both in ready.items() for side, own in zip(SIDES, both, strict=True)}
     with taken(folders, resume=True) as places:
         with begun(places, workers, progress) as runs:
             folder_and_runs = zip(ready, runs[::2], runs[1::2], strict=True)
@@ -122,8 +112,9 @@ def together(scenarios: list[PairedScenario], campaign: Campaign) -> Pairs:
     """The pairs of one scenario, per test; of several, those of all, per hour."""
     if campaign.scenarios is None:
         return scenarios[0].pairs
-    pairs = tuple(own for scenario in scenarios for own in scenario.pairs.each)
-    return Pairs(pairs, tuple(scenario.tests_per_hour for scenario in scenarios))
+    pairs = tuple(part for scenario in scenarios for part in scenario.pairs.each)
+    tests_per_hour = (each.exposure.per_hour / each.runs[0].prescribed.design.p_counted for each in scenarios)
+    return Pairs(pairs, tuple(tests_per_hour))
 
 
 def stored_requests(earlier: Earlier) -> Iterator[ShardRequest]:

@@ -122,10 +122,10 @@ def run_families(campaign: Campaign, out: Path, *, workers: int | None, resume: 
             ready[name] = require_ready(campaign.of_family(name))
     require_same_driver(campaign, ready)
     rule = RoundRule(campaign)
-    with ExitStack() as held:
-        held.enter_context(sole_use(out))
+    with ExitStack() as locks:
+        locks.enter_context(sole_use(out))
         require_no_other(out, [*ready, FAMILIES, CAMPAIGN])
-        places = held.enter_context(taken({out / name: resolved for name, resolved in ready.items()}, resume=resume))
+        places = locks.enter_context(taken({out / name: resolved for name, resolved in ready.items()}, resume=resume))
         began -= max(float(earlier.get("wall_time_s") or 0.0) for _, earlier in places.values())
         if any(earlier["n_episodes"] for _, earlier in places.values()):
             require_same_shares(out, campaign)

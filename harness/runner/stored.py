@@ -108,9 +108,9 @@ def estimate_run(
     manifest = read_manifest(folder)
     campaign = read_campaign(folder, manifest)
     require_trust(folder, manifest, campaign.testing.estimator, "Read that code, and run campaign.yaml yourself.")
-    asked = asked_for(estimators or ESTIMATORS, "harness.estimate(estimators=…)")
-    blocks = stored_blocks(folder, moments=not {*asked} < {*ESTIMATORS} - {"scv"})
-    content = estimate_blocks(even(blocks), campaign, manifest, estimators=asked, confidence=confidence)
+    wanted = asked_for(estimators or ESTIMATORS, "harness.estimate(estimators=…)")
+    blocks = stored_blocks(folder, moments=not {*wanted} < {*ESTIMATORS} - {"scv"})
+    content = estimate_blocks(even(blocks), campaign, manifest, estimators=wanted, confidence=confidence)
     return StoredEstimates(content, folder, by_estimator=estimators is not None)
 
 

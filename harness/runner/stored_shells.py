@@ -92,11 +92,6 @@ class StoredShells:
         blocks = list(stored_blocks(folder, moments=False))
         return cls(folder, manifest, blocks, here, design, pool, here, design)
 
-    @property
-    def limit_mps2(self) -> float:
-        """Hardest acceleration that its strata allow for."""
-        return tested_limit(self.here.campaign)
-
     @cached_property
     def seen(self) -> SeenShells:
         """Its tests, counted."""
@@ -154,8 +149,9 @@ class StoredShells:
         valid = [environment for environment in environments if environment is not None]
         progress.stage("other traffic", len(valid))
         p, shares = self.design.p, reference_shares(self.tested)
-        paths = FewPaths(self.traffic, self.pool, self.tested, self.limit_mps2, progress)
-        (base,), on_paths = paths.of([self.traffic.environment]), paths.of(valid)
+        paths = FewPaths(self.traffic, self.pool, self.tested, tested_limit(self.here.campaign), progress)
+        (base,) = paths.of([self.traffic.environment])
+        on_paths = paths.of(valid)
         crash_share = self.seen.tally.share if self.seen.tally.crashes.any() else np.ones_like(p)
 
         def moved(other: OnPaths) -> Nearby:
@@ -223,7 +219,7 @@ def moved_to(tested: StoredShells, there: Resolved, name: str, progress: Progres
     require_shares(tested)
     progress.stage("pool of the other traffic", None)
     pool = campaign_pool(there, progress, order=tested.pool.names)
-    design = moved_design(tested.tested, design_shells(pool, tested.limit_mps2), name)
+    design = moved_design(tested.tested, design_shells(pool, tested_limit(tested.here.campaign)), name)
     moved = replace(tested, traffic=there, design=design)
     off, beyond = moved.reference_error(), _share_beyond(tested, pool)
     if beyond > MOST_BEYOND or off > MOST_OFF:
@@ -246,10 +242,9 @@ def require_shares(tested: StoredShells) -> None:
 
 
 def moved_design(tested: ShellDesign, new: ShellDesign, environment: str) -> ShellDesign:
-    """The strata ``tested`` with the probabilities of a ``new`` design, cell by cell.
+    """The strata ``tested`` with the probabilities of a ``new`` design; `CampaignError` if one was never tested.
 
-    A cell goes to one of the same stratum and reference drivers, else to the first of the stratum. Raises
-    `CampaignError`: a stratum was never tested.
+    A cell of the new one goes to that of the same stratum and reference drivers, else to the first of the stratum.
     """
     cells = _cells(tested)
     cell_p = np.zeros(len(cells))

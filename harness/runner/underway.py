@@ -118,21 +118,19 @@ class Underway:
     def _before(self, name: str, n: int) -> pa.Table:
         """Run the ``n`` baseline runs or milder events, but those that an earlier run has left: all, as a table."""
         what = paths.IN_WORDS[name]
-        causes = Counter[str]()
         self.progress.stage(f"{what}{self.crew.where}", n)
         stored = paths.stored_table(self.run.folder, self.run.parts_before, name)
         known = partial(paths.stored_baseline, stored, self.run.source.baseline_paths)
         for result in self.crew.run(paths.requests_before(name, n), known):
             with uninterrupted():
                 self.run = self.run.with_baseline(name, result)
-            causes += result.failures
             self.progress.advance(result.request.n_episodes)
+        table = pa.concat_tables(self.run.before[name])
         if name != MILDER:  # these are few: one that fails is reported as if it had crashed
-            campaign = self.run.resolved.campaign
-            table = f"the run folder's {name}/ table"
+            campaign, causes = self.run.resolved.campaign, Counter(table["failure"].drop_null().to_pylist())
             again = f"`harness av-check VEHICLE --scenario {campaign.scenario}` drives it alone"
-            kept.require_few_failed(causes, n, campaign, again, what, table)
-        return pa.concat_tables(self.run.before[name])
+            kept.require_few_failed(causes, n, campaign, again, what, f"the run folder's {name}/ table")
+        return table
 
     def drive_tests(self) -> Rule:
         """Drive rounds of tests until the rule has enough; returns the rule, which knows why."""

@@ -10,7 +10,6 @@ not accepted.
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -88,9 +87,9 @@ def forced_after_runs(loop: EpisodeLoop, resolved: Resolved, paths: Paths) -> Tr
     """
     parts = []
     for begin in range(0, len(paths.number), AT_ONCE):
-        some = Paths(*(column[begin : begin + AT_ONCE] for column in paths))
-        runs = recorded(without_event(loop, resolved, resolved.campaign.seed, some))
-        parts.append(forced(resolved, some, runs))
+        chunk = Paths(*(column[begin : begin + AT_ONCE] for column in paths))
+        runs = recorded(without_event(loop, resolved, resolved.campaign.seed, chunk))
+        parts.append(forced(resolved, chunk, runs))
     script = Script._make(np.concatenate(columns) for columns in zip(*(part.script for part in parts), strict=True))
     return Traffic(script, np.concatenate([part.facts for part in parts]))
 
@@ -139,11 +138,6 @@ class BaselineResult:
     request: ShardRequest
     table: pa.Table
 
-    @property
-    def failures(self) -> Counter[str]:
-        """Number of failures by cause."""
-        return Counter(self.table.column("failure").drop_null().to_pylist())
-
 
 def requests_before(name: str, n: int) -> Iterator[ShardRequest]:
     """Requests for ``n`` baseline runs, or tests of milder events, in order; ``name`` is that of their table."""
@@ -153,9 +147,9 @@ def requests_before(name: str, n: int) -> Iterator[ShardRequest]:
 
 def run_baseline(loop: EpisodeLoop, paths: BaselinePaths, resolved: Resolved, request: ShardRequest) -> BaselineResult:
     """Drive the loop's vehicle along a range of paths."""
-    some = Paths(paths.index[request.rows], paths.start[request.rows])
-    shard = without_event(loop, resolved, paths.seed, some, request.first_episode)
-    return BaselineResult(request, baseline_table(shard, some.number, paths.weight[request.rows]))
+    driven = Paths(paths.index[request.rows], paths.start[request.rows])
+    shard = without_event(loop, resolved, paths.seed, driven, request.first_episode)
+    return BaselineResult(request, baseline_table(shard, driven.number, paths.weight[request.rows]))
 
 
 def stored_table(folder: Path, before: Mapping[str, Part], name: str) -> pa.Table | None:
