@@ -167,9 +167,8 @@ def named_vehicle(text: str, option: str = "") -> dict[str, Any]:
     """The ``av`` section that a word stands for; a `CampaignError` if it stands for none.
 
     That is a Python class or function, ``my_av.py:MyClass`` or ``package.module:MyClass``; a TraCI script,
-    ``my_script.py`` or, a function of it that takes nothing, ``my_script.py:main``; the path of an FMU; one of
-    SUMO's car-following models, ``sumo:ACC``; a vehicle of a panel, ``PANEL.yaml:NAME``; or, without a colon, one of
-    the shipped panel, or a built-in model.
+    ``my_script.py``, or a function of it without arguments, ``my_script.py:main``; the path of an FMU; a model of
+    SUMO's, ``sumo:ACC``; a vehicle of a panel, ``PANEL.yaml:NAME``; one of the shipped panel, or a built-in model.
     """
     place, colon, name = text.rpartition(":")
     if text.endswith(".fmu"):

@@ -106,7 +106,8 @@ class Override:
 def parse_override(text: str) -> Override:
     """Read ``testing.epsilon=0.2`` (else `CampaignError`), the value by the same rules as in a campaign file."""
     path, equals, value = text.partition("=")
-    parts, option = tuple(part.strip() for part in path.split(".")), f"--set {text}"
+    parts = tuple(part.strip() for part in path.split("."))
+    option = f"--set {text}"
     if not equals or not all(parts):
         raise CampaignError(option, "no path and value", "section.key=value", "For example: --set testing.epsilon=0.2")
     return Override(parts, parse_value(value, option), option)

@@ -1,8 +1,7 @@
 """Python files of the user's: what one holds, told without running it, and how it is imported.
 
 It is compiled from its source, as this is now. Python's own cache (``__pycache__``) goes by a source's size and its
-time stamp in seconds: where both are the same, as of versions that are copied, restored or edited within a second, it
-runs code that is no longer there.
+time stamp in seconds: where both are the same, as of a version edited within a second, it runs code that is gone.
 """
 
 from __future__ import annotations

@@ -45,10 +45,7 @@ def dotted(where: YamlPath) -> str:
 
 
 def read_yaml(path: str | Path) -> tuple[dict[str, Any], Lines]:
-    """Read a UTF-8 file with one YAML 1.2 document whose top level is a mapping: its plain data, and their lines.
-
-    Any other file, and one that says a key twice, is a `CampaignError`.
-    """
+    """Data and lines of a UTF-8 file with one YAML 1.2 mapping, without double keys; else a `CampaignError`."""
     name = str(path)
     data, lines = deepcopy(_parsed(read_text(Path(path)), name))
     if not lines:
@@ -142,8 +139,7 @@ class StrictLoader(SafeLoader):
 def _checked_lines(root: Node) -> Lines:
     """Line of every value by its path, aliases written out.
 
-    Too many values or levels are refused, as with aliases a few lines can stand for billions of values; so are keys
-    that are no text, or written twice.
+    Refused are too many values or levels, which a few aliases can stand for, and keys that are double or no text.
     """
     lines: Lines = {(): root.start_mark.line + 1}
     waiting: list[tuple[tuple[str | int, ...], Node]] = [((), root)]

@@ -195,8 +195,7 @@ def _loaded_once(
 def _as_class(target: Callable[..., Any], name: str) -> tuple[Callable[..., Any], dict[str, Any]]:
     """What makes a controller when called with the parameters; and what else ``target`` is handed, by name.
 
-    Nothing is called that a campaign names but a class with a step, and a function that is itself the vehicle: its
-    first argument is what the vehicle sees.
+    A class needs a step; a function is itself the vehicle, and its first argument is what the vehicle sees.
     """
     takes = _signature(target).parameters
     first = next(iter(takes.values()), None)
@@ -333,7 +332,8 @@ def _sources_of_made(av: AutomatedVehicle) -> str | None:
         file, above = file_and_function(av.controller)[0], 0
     else:
         name = getattr(own_code(av.controller), "__module__", "")
-        file, above = getattr(sys.modules.get(name), "__file__", None) or "", name.count(".")
+        file = getattr(sys.modules.get(name), "__file__", None) or ""
+        above = name.count(".")
         above += file.endswith("__init__.py")  # which stands within the package that it is
     files = {str(real_path(file)), *(name for name, digest in hashes.items() if digest == _hash_of(name))}
     if is_users(root := str(real_path(file).parents[above])):

@@ -72,7 +72,7 @@ LONGEST_CAUSE = 240
 def cause_of(error: BaseException) -> str:
     """What an error says, in one line of UTF-8 for the record, with the place in the user's code.
 
-    Where it asks for a name that is not there, a similar one is suggested. Making the text runs the user's code.
+    If it asks for a name that is not there, a similar one is suggested. Making the text runs the user's code.
     """
     try:
         text = f"{type(error).__name__}: {error}".rstrip(": ")
@@ -103,8 +103,7 @@ class StepTimeoutError(BaseException):
 class Guard:
     """Makes the calls of a host's controllers, inside of ``with guard``, and limits the time of each.
 
-    The limit is a signal, and needs the main thread, where workers run controllers. In a worker a call that the
-    exception does not end (compiled code, a bare ``except``) ends the process.
+    The limit is a signal, for the main thread. In a worker, a call that outlasts it (compiled code) ends the process.
     """
 
     _current: ClassVar[Guard | None] = None
@@ -145,10 +144,7 @@ class Guard:
         check: Callable[[Any], tuple[Any, str | None]] | None = None,
         makes: bool = False,
     ) -> tuple[Any, str | None]:
-        """What a call returns, and what went wrong; ``check`` looks at an answer under the same protection.
-
-        One that ``makes`` a controller has a time limit of its own.
-        """
+        """What a call returns, and what went wrong, also in a ``check`` of it; one that ``makes`` may take longer."""
         Guard.n_calls += 1
         try:
             self.limit(makes=makes)
@@ -194,10 +190,7 @@ class Guard:
         Guard._current = None
 
     def acceleration(self, answer: Any) -> tuple[float, str | None]:
-        """An answer as a number, and what is wrong with it: a subclass may compare as it likes.
-
-        An array of one element, as policies give it, is that.
-        """
+        """An answer as a number, also if an array of one, and what is wrong with it: subclasses compare as they like."""
         if not isinstance(answer, float) and hasattr(answer, "__array__") and not np.ma.is_masked(answer):
             array = np.asarray(answer)
             answer = array.item() if array.size == 1 and array.dtype.kind in "iufO" else answer
@@ -294,8 +287,7 @@ class VehicleHost(Host):
     def act(self, observation: BatchObservation, *, warms_up: bool = False) -> tuple[FloatArray, Failures]:
         """Accelerations (m/s²), shape (n,), and the cells whose controller failed (their value is not used).
 
-        One that ``warms_up`` is shown the past: its answer is neither used nor judged, and 0 if it is no number; an
-        error that it raises counts.
+        One that ``warms_up`` is shown the past: what it answers is not used nor judged, what it raises counts.
         """
         answer, failures = np.zeros(observation.cell.size), dict[int, str]()
         call, check = self.guard.call, self.guard.not_judged if warms_up else self.guard.acceleration
@@ -330,10 +322,7 @@ def _step(controller: VehicleController, seen: list[Any]) -> Any:
 
 
 def _numbers(n: int, answer: Any) -> tuple[FloatArray | None, str | None]:
-    """An answer as (n,) float64, and what is wrong with it: a cast would make numbers of texts and of complex ones.
-
-    That of a policy may be (n, 1).
-    """
+    """An answer as (n,) float64, also from (n, 1), and what is wrong with it: a cast would take texts, too."""
     array = np.ma.array(answer, object).filled(np.nan) if np.ma.is_masked(answer) else np.array(answer)
     array = array[:, 0] if array.shape == (n, 1) else array
     if array.shape != (n,):

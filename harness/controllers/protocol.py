@@ -27,9 +27,9 @@ class Neighbour(NamedTuple):
 class EpisodeStart:
     """What a per-vehicle controller is told when an episode begins: its index, and the time (s) between two steps.
 
-    ``set_speed_mps`` is the speed at which its vehicle cruises. ``lv_name`` and ``bv_name`` are what the vehicles are
-    called that it sees as ``lv`` and ``bv``, empty where there is none. ``random`` is the only randomness that a
-    controller may use: seeded by campaign and episode, so that a replay sees the same.
+    ``set_speed_mps`` is the speed at which its vehicle cruises; ``lv_name`` and ``bv_name`` name the vehicles that it
+    sees as ``lv`` and ``bv``, empty where there is none. ``random``, seeded by campaign and episode, is the only
+    randomness that it may use, so that a replay sees the same.
     """
 
     episode: int
@@ -116,8 +116,7 @@ class BatchObservation(NamedTuple):
 class VehicleController(Protocol):
     """One AV. The class is called once per cell with the campaign's ``av.parameters`` as keyword arguments.
 
-    Where it has them, ``start(EpisodeStart)`` begins an episode and forgets the last one, and ``close()`` releases in
-    the end what the controller holds.
+    Optional are ``start(EpisodeStart)``, which begins an episode and forgets the last one, and ``close()`` in the end.
     """
 
     def step(self, observation: Observation) -> float:
@@ -127,8 +126,8 @@ class VehicleController(Protocol):
 class BatchController(Protocol):
     """All AVs of a worker. The class is called once with the campaign's ``av.parameters`` as keyword arguments.
 
-    Where it has them, ``start_batch(cells, episodes, random)`` begins episodes in these cells, each with the only
-    randomness that its controller may use, and ``close()`` releases in the end what the controller holds.
+    Optional are ``start_batch(cells, episodes, random)``, which begins episodes in these cells, each with the only
+    randomness that its controller may use, and ``close()`` in the end.
     """
 
     def step_batch(self, observation: BatchObservation) -> FloatArray:

@@ -99,9 +99,8 @@ class TraciStyleController:
 class StepListenerController(TraciStyleController):
     """Runs an object with the shape of ``traci.StepListener``: ``step(t)``, and ``cleanUp()`` if it has one.
 
-    ``listener``, its class, is called for every episode, with the object that stands for ``traci`` and the
-    ``parameters``. As under TraCI it is removed when ``step`` returns something false, and the AV then follows its
-    last command.
+    ``listener``, its class, is called in every episode with what stands for ``traci`` and the ``parameters``. As under
+    TraCI it is removed when ``step`` returns something false; the AV then follows its last command.
     """
 
     def __init__(self, listener: Callable[..., Any], **parameters: Any) -> None:

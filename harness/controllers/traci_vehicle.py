@@ -44,10 +44,10 @@ class SeenVehicle:
 
 
 _QUESTIONS: dict[str, tuple[int, Callable[[SeenVehicle], Any]]] = {
-    "getLateralSpeed": (0x32, lambda of: of.sideways_speed),
-    "getSpeed": (0x40, lambda of: of.speed),
-    "getMaxSpeed": (0x41, lambda of: of.max_speed),  # of the AV that at which it cruises
-    "getPosition": (0x42, lambda of: (of.position, LANE_CENTRES_M[of.lane] + of.sideways)),
+    "getLateralSpeed": (0x32, lambda car: car.sideways_speed),
+    "getSpeed": (0x40, lambda car: car.speed),
+    "getMaxSpeed": (0x41, lambda car: car.max_speed),  # of the AV that at which it cruises
+    "getPosition": (0x42, lambda car: (car.position, LANE_CENTRES_M[car.lane] + car.sideways)),
     "getAngle": (0x43, lambda _: 90.0),  # degrees: along x
     "getLength": (0x44, lambda _: VEHICLE_LENGTH_M),
     "getVehicleClass": (0x49, lambda _: "passenger"),
@@ -55,13 +55,13 @@ _QUESTIONS: dict[str, tuple[int, Callable[[SeenVehicle], Any]]] = {
     "getWidth": (0x4D, lambda _: 1.8),  # SUMO's of passenger cars
     "getTypeID": (0x4F, lambda _: "exact"),
     "getRoadID": (0x50, lambda _: ROAD),
-    "getLaneID": (0x51, lambda of: f"{ROAD}_{of.lane}"),
-    "getLaneIndex": (0x52, lambda of: of.lane),
-    "getLanePosition": (0x56, lambda of: of.position),
+    "getLaneID": (0x51, lambda car: f"{ROAD}_{car.lane}"),
+    "getLaneIndex": (0x52, lambda car: car.lane),
+    "getLanePosition": (0x56, lambda car: car.position),
     "getSpeedFactor": (0x5E, lambda _: 1.0),
-    "getDistance": (0x84, lambda of: of.position),  # as if it had departed where the road begins
-    "getAcceleration": (0x72, lambda of: of.acceleration),
-    "getLateralLanePosition": (0xB8, lambda of: of.sideways),
+    "getDistance": (0x84, lambda car: car.position),  # as if it had departed where the road begins
+    "getAcceleration": (0x72, lambda car: car.acceleration),
+    "getLateralLanePosition": (0xB8, lambda car: car.sideways),
 }
 """Questions about a vehicle: their numbers in ``traci.constants``, and what answers them. Front bumpers count."""
 _VARIABLES = {number: name for name, (number, _) in _QUESTIONS.items()} | {_LEADER: "getLeader", 0x78: "getFollower"}
@@ -226,7 +226,8 @@ class VehicleDomain(Domain):
 
     def _nearest(self, vehID: str, direction: float, lane: int | None = None) -> tuple[str, float] | None:
         own = self._of(vehID)
-        here, lane = own.position, own.lane if lane is None else lane
+        here = own.position
+        lane = own.lane if lane is None else lane
         nearest: tuple[str, float] | None = None
         for name, other in self._seen.items():
             there = other.position
@@ -316,10 +317,10 @@ def _question(answer: Callable[[SeenVehicle], Any]) -> Callable[[VehicleDomain, 
     return lambda self, vehID: answer(self._of(vehID))
 
 
-def _of_the_av(name: str, kept: str) -> Callable[[VehicleDomain, str], Any]:
+def _of_the_av(name: str, attribute: str) -> Callable[[VehicleDomain, str], Any]:
     def ask(self: VehicleDomain, vehID: str) -> Any:
         self._require_own(vehID, name, "is not known of traffic")
-        if (value := getattr(self, kept)) == math.inf:
+        if (value := getattr(self, attribute)) == math.inf:
             raise RefusedError(f"vehicle.{name}('{vehID}') is refused before set{name[3:]}: nothing bounds the AV.")
         return value
 
@@ -341,7 +342,7 @@ def _accepted(name: str, holds: Callable[[Any], bool], what_holds: str) -> Calla
 
 _FROM_TABLES: dict[str, Callable[..., Any]] = {
     **{name: _question(answer) for name, (_, answer) in _QUESTIONS.items()},
-    **{name: _of_the_av(name, kept) for name, kept in _OF_THE_AV.items()},
+    **{name: _of_the_av(name, attribute) for name, attribute in _OF_THE_AV.items()},
     **{name: _neighbours(mode) for mode, name in enumerate(_NEIGHBOURS)},
     **{name: _accepted(name, *row) for name, row in _ACCEPTED.items()},
 }

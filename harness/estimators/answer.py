@@ -15,7 +15,7 @@ from harness.campaign.sections import LEAST_POOL_ERROR, MOST_EVENTS
 from harness.estimators.block import ACTS, Block
 from harness.estimators.estimate import Estimate, Note, Number, Point, Unavailable, finite_json
 from harness.estimators.likelihood import Level
-from harness.estimators.one_pass import Asked, headline_of, one_pass
+from harness.estimators.one_pass import AnyEstimator, headline_of, one_pass
 from harness.estimators.severity import Severity
 from harness.estimators.shells import SeenShells
 from harness.estimators.stopping import Rule
@@ -109,20 +109,21 @@ def estimate_blocks(
     campaign: Campaign,
     manifest: Mapping[str, Any],
     *,
-    estimators: Collection[Asked] | None = None,
+    estimators: Collection[AnyEstimator] | None = None,
     confidence: float | None = None,
 ) -> dict[str, Any]:
     """Estimates of blocks that cover a campaign's episodes, as JSON content.
 
     Blocks are contiguous and in index order; ``manifest`` is the run's, of which nothing but ``campaign_hash`` need be
-    known. Nothing is said per km where it has no ``distance_per_test_m``, the mean distance that the AV drives in a
-    naturalistic test. ``estimators`` are reported beside the campaign's own, all by default; ``confidence`` is the
-    level of the intervals, by default the campaign's.
+    known. Without its ``distance_per_test_m``, the mean distance of the AV in a naturalistic test, nothing is said per
+    km. ``estimators`` are reported beside the campaign's own, all by default; ``confidence`` replaces the campaign's.
     """
-    confidence, own = confidence or campaign.stop.confidence, headline_of(campaign)
+    confidence = confidence or campaign.stop.confidence
+    own = headline_of(campaign)
     done = one_pass(blocks, estimators or ESTIMATORS, own, confidence, manifest.get("onset_step"))
     best = done.headline_estimate
-    level, distance_m = campaign.environment.lane_change_level, manifest.get("distance_per_test_m")
+    level = campaign.environment.lane_change_level
+    distance_m = manifest.get("distance_per_test_m")
     distance_km = None if distance_m is None else distance_m / 1000.0
     rates = ("rate", best.crash_rate), ("ci_low", best.ci_low), ("ci_high", best.ci_high)
     estimates = Estimates(

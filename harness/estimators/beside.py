@@ -32,9 +32,9 @@ from harness.vocabulary import BoolArray, FloatArray
 class BesideReference:
     """A vehicle beside a reference driver.
 
-    ``crash_rate`` is the reference's, with its standard error. ``ratio`` is the vehicle's crash rate over it, and
-    ``preventable`` the share of the vehicle's crashes that the reference would have avoided; NaN where it is not
-    defined. ``delay_s`` (s) is when the reference begins to brake after the event, None if it has no delay of its own.
+    ``crash_rate`` and ``std_error`` are the reference's. ``ratio`` is the vehicle's crash rate over it, ``preventable``
+    the share of the vehicle's crashes that the reference would have avoided; NaN where not defined. ``delay_s`` (s) is
+    when the reference begins to brake after the event, None if it has no delay of its own.
     """
 
     reference: str
@@ -51,7 +51,8 @@ class BesideReference:
 
 def compared(design: ShellDesign, cells: Tally, level: Level) -> tuple[BesideReference, ...]:
     """The vehicle beside each reference that crashes at all; ``cells`` are its tests by the design's cells."""
-    rows, rate_of_vehicle = [], float(design.p @ cells.joined(design.joined).share)
+    rows = []
+    rate_of_vehicle = float(design.p @ cells.joined(design.joined).share)
     for r, reference in enumerate(design.references):
         if (rate := float(design.reference_rate[r])) == 0.0:
             continue
@@ -68,7 +69,8 @@ def beside(design: ShellDesign, cells: Tally, r: int, n_strata: int, level: Leve
     p, strata = design.p[:n_strata], slice(0, n_strata)
 
     def limits(tests: Tally) -> tuple[float, float]:
-        tally, errors = tests.joined(design.joined).part(strata), path_errors(design, tests, r, n_strata)
+        tally = tests.joined(design.joined).part(strata)
+        errors = path_errors(design, tests, r, n_strata)
         if paths_that_count(p, tally) < FEWEST_PATHS:
             return 0.0, math.inf
         return limits_over(float(design.reference_rate[r]), p, tally.outcomes, errors, level)

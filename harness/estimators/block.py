@@ -59,11 +59,10 @@ Column = NDArray[Any]
 class SamplingPlan:
     """How all tests of a campaign are drawn.
 
-    ``alpha`` (M,) are mixture weights of the importance functions; ``weight_cap`` is the bound on Y = 1{crash}·weight
-    that the design guarantees for every episode, seen or not, None if there is none; ``epsilon`` is the least share of
-    its exposure with which the step mixture draws a maneuver; ``shells`` is what is known of the strata, where tests
-    are drawn from some. Crashes count with an impact above ``counts_above_mps``, all of them at 0. ``names`` (M,) are
-    those of the importance functions.
+    ``alpha`` (M,) are the mixture weights of the importance functions ``names``; ``weight_cap`` bounds Y =
+    1{crash}·weight of every episode by design, seen or not, None if nothing does; ``epsilon`` is the least share of its
+    exposure with which the step mixture draws a maneuver; ``shells`` is what is known of the strata, where tests are
+    drawn from some. Crashes count with an impact above ``counts_above_mps``, all of them at 0.
     """
 
     method: Method
@@ -213,11 +212,11 @@ def block_from_tables(
 ) -> Block:
     """Block of one shard; rows that are missing, out of order, or contradict each other are a `RunFolderError`.
 
-    ``episodes`` are rows of that table, consecutive and in index order, with `EPISODE_COLUMNS`, of ``shells`` also
-    `SHELL_COLUMNS`; ``moments``, of the step mixture, are the control steps of the same episodes, sorted by episode and
-    step, with `MOMENT_COLUMNS`.
+    ``episodes`` are consecutive rows of that table, in index order, with `EPISODE_COLUMNS`, of ``shells`` also
+    `SHELL_COLUMNS`; ``moments``, of the step mixture, are their control steps in order, with `MOMENT_COLUMNS`.
     """
-    sampling, alpha = campaign.sampling, np.array(campaign.mixture_weights, dtype=np.float64)
+    sampling = campaign.sampling
+    alpha = np.array(campaign.mixture_weights, dtype=np.float64)
     index = _integers(episodes, "episode")
     if not index.size:
         raise _damaged("episodes", "no rows", "at least one episode per shard")

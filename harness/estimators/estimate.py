@@ -20,8 +20,7 @@ from harness.estimators.block import Block
 Number = Annotated[float, BeforeValidator(lambda value: math.nan if value is None else value)]
 """What JSON has as null, because it was infinite or not defined, is read as NaN: not known."""
 WIDE_RHW = 0.5
-"""Relative half-width from which on a rate says less than its limits, and stopping at the first such interval biases
-it noticeably."""
+"""Relative half-width above which a rate says less than its limits; stopping at the first one below biases it."""
 
 
 @dataclass(frozen=True)
@@ -48,14 +47,13 @@ CapKind = Literal["design", "tests", "none"]
 class Estimate:
     """A crash rate per test, how sure it is, and what a reader must know to trust it.
 
-    ``crash_rate`` and ``std_error`` are in crashes per test, as are the two-sided interval ``ci_low``, ``ci_high`` and
-    the one-sided ``upper_bound`` at ``confidence``, which are finite also when no crash was seen. ``rhw`` is the
-    interval's half-width relative to the rate, infinite when the rate is 0. Of ``n_episodes`` tests ``n_crashes`` are
-    crashes; ``n_effective`` is (ΣY)²/ΣY², ``largest_weight_share`` the largest single Y as a share of ΣY, and
-    ``weight_cap`` the largest weight that a crash can have by design, infinite where nothing is known to bound it.
-    ``interval`` and ``bound`` say how these were made, ``cap`` what Hoeffding's bound rests on. ``warnings`` are what
-    a reader must know, the ``cautions`` first: why the interval may be wrong, so that no precision is claimed.
-    ``details`` are what only this estimator has to say.
+    ``crash_rate``, ``std_error``, the two-sided interval ``ci_low``, ``ci_high`` and the one-sided ``upper_bound``,
+    both at ``confidence``, are in crashes per test; limits are finite also when no crash was seen. ``rhw`` is the
+    interval's half-width relative to the rate, infinite when the rate is 0. ``n_effective`` is (ΣY)²/ΣY²,
+    ``largest_weight_share`` the largest single Y as a share of ΣY, and ``weight_cap`` the largest weight that a crash
+    can have by design, infinite where nothing is known to bound it. ``interval`` and ``bound`` say how these were made,
+    ``cap`` what Hoeffding's bound rests on. ``warnings`` are what a reader must know, the ``cautions`` first: why the
+    interval may be wrong, so that no precision is claimed. ``details`` are what only this estimator has to say.
     """
 
     crash_rate: float

@@ -118,10 +118,10 @@ def spread(weights: FloatArray, lower: Counts, upper: Counts, level: Level, size
     a stratum moves a limit by KL(c_s ‖ θ_s)/ν, by the envelope theorem; one without a test comes first. The counts
     (S, J) that either limit is from differ by what failed tests may have been.
     """
-    given = np.zeros_like(most)
+    more = np.zeros_like(most)
     below, above = WeightedSum.of(weights, lower, -1.0), WeightedSum.of(weights, upper, 1.0)
-    give(below, above, level, min(size, int(most.sum())), -(-size // PORTIONS), most, given)
-    return given
+    give(below, above, level, min(size, int(most.sum())), -(-size // PORTIONS), most, more)
+    return more
 
 
 def ratio_limits(
@@ -133,9 +133,8 @@ def ratio_limits(
 ) -> tuple[float, float]:
     """Limits of x = Σ a_sj θ_sj / Σ b_sj θ_sj: the ratios x for which the contrast Σ (a - x b)θ may be 0.
 
-    Both its limits fall as x grows, so that these are an interval: from 0 where the sum above may be nothing, to
-    infinity where the one below may. Factors ``above`` and ``below`` (S, J) are not negative; ``variance`` is that of
-    the further error of the contrast at a ratio.
+    The contrast's limits fall as x grows, so that these x are an interval: from 0 where the sum above may be nothing,
+    to infinity where the one below may. No factor (S, J) is negative; ``variance`` is of the contrast's further error.
     """
 
     def limit(side: float, x: float) -> float:
@@ -238,10 +237,7 @@ def _gain(strata: WeightedSum, s: int, nu: float) -> float:
 
 @compiled
 def _root(strata: WeightedSum, level: Level, low: float, high: float, by_crashes: bool) -> float:
-    """Where a multiplier begins to be refused: regula falsi, an end that stays counting half (Illinois).
-
-    Compiled code cannot call scipy's roots, and this is a planner's hot loop.
-    """
+    """Where a multiplier begins to be refused, by regula falsi (Illinois): compiled code cannot call scipy's roots."""
     at_low, at_high = _refusal(strata, level, low, by_crashes), _refusal(strata, level, high, by_crashes)
     end = 1e-13 * high
     last = 0
@@ -294,10 +290,7 @@ def _at(strata: WeightedSum, level: Level, nu: float, threshold: float) -> tuple
 def _profile(
     nu: float, weights: FloatArray, tests: FloatArray, share: FloatArray, variance: float, theta: FloatArray
 ) -> tuple[float, float, float]:
-    """Sum, T and effective number of crashes at a multiplier; a stratum without a test is at its end at no cost.
-
-    ``theta``, shape (J,), is room for the shares of one stratum.
-    """
+    """Sum, T and effective number of crashes at a multiplier; ``theta`` (J,) is room for the shares of one stratum."""
     total = variance * nu
     cost = 0.5 * variance * nu * nu
     spread = fourth = 0.0
@@ -308,7 +301,7 @@ def _profile(
             if nu * weights[s, j] > nu * weights[s, best]:
                 best = j
         n = tests[s]
-        if n == 0.0:
+        if n == 0.0:  # at its end, at no cost
             total += weights[s, best]
             continue
         slope = nu / n

@@ -2,8 +2,7 @@
 
 One of a user's own, ``my.py:Class``, an entry point of the group ``harness.estimators``, or an object, is a class that
 names the ``methods`` whose tests it can use, is fed blocks of them (``add``), and says (``result``, at a confidence) a
-rate and its standard error, or a whole `Estimate`. What a block is drawn by, with the campaign's epsilon, mixture
-weights and names, is ``block.drawn``.
+rate and its standard error, or a whole `Estimate`. ``block.drawn`` is what a block is drawn by.
 """
 
 from __future__ import annotations
@@ -63,7 +62,7 @@ class OwnEstimator:
         return self.name
 
 
-Asked: TypeAlias = EstimatorName | OwnEstimator
+AnyEstimator: TypeAlias = EstimatorName | OwnEstimator
 
 
 class OwnState(Nade):
@@ -143,7 +142,7 @@ class Diagnostics:
         return {"mean": sums.mean(self.n), "std_error": sums.std_error(self.n)} if has_mean else UNKNOWN_MEAN
 
 
-def asked_for(estimators: Iterable[Any], where: str) -> list[Asked]:
+def asked_for(estimators: Iterable[Any], where: str) -> list[AnyEstimator]:
     """The estimators that a user asks for: by name, by ``my.py:Class``, as a class, or as an object.
 
     Raises `HarnessError`: there is no such estimator, or it says not whose tests it can use.
@@ -159,10 +158,11 @@ def _own(of: Any, where: str) -> OwnEstimator:
     if isinstance(of, str):
         installed = {each.name: each.value for each in entry_points(group="harness.estimators")}
         if of not in installed and ":" not in of:
-            known = [*ESTIMATORS, *installed]
-            mend = did_you_mean(of, known) or "Write my.py:MyEstimator for one of your own."
-            raise HarnessError(where, f"'{of}'", f"one of {', '.join(map(repr, known))}, or my.py:MyEstimator", mend)
-        name, made = of.rpartition("/")[2], own_code(installed.get(of, of), where, wanted)
+            names = [*ESTIMATORS, *installed]
+            mend = did_you_mean(of, names) or "Write my.py:MyEstimator for one of your own."
+            raise HarnessError(where, f"'{of}'", f"one of {', '.join(map(repr, names))}, or my.py:MyEstimator", mend)
+        name = of.rpartition("/")[2]
+        made = own_code(installed.get(of, of), where, wanted)
     if missing := [each for each in ("methods", "add", "result") if not hasattr(made, each)]:
         raise HarnessError(where, f"{name} without {' and '.join(missing)}", wanted, "Add what is missing.")
     if isinstance(made.methods, str) or not {*made.methods} <= {*METHODS} - {"shells"}:
@@ -173,7 +173,7 @@ def _own(of: Any, where: str) -> OwnEstimator:
     return OwnEstimator(name, made if isinstance(made, type) else partial(deepcopy, made), tuple(made.methods))
 
 
-def headline_of(campaign: Campaign) -> Asked:
+def headline_of(campaign: Campaign) -> AnyEstimator:
     """Whose estimate answers a campaign's question and stops it: its own, or its method's.
 
     Raises `HarnessError`: there is no such estimator, or it cannot use such tests.
@@ -186,13 +186,13 @@ def headline_of(campaign: Campaign) -> Asked:
     return estimator
 
 
-def _can_use(estimator: Asked, method: Method) -> bool:
+def _can_use(estimator: AnyEstimator, method: Method) -> bool:
     if isinstance(estimator, OwnEstimator):
         return method in estimator.methods
     return estimator in SAMPLING[method].estimators
 
 
-def refusal(block: Block, estimator: Asked) -> Note | None:
+def refusal(block: Block, estimator: AnyEstimator) -> Note | None:
     """Why records like this block do not allow an estimator; None if they do."""
     method = block.drawn.method
     if not _can_use(estimator, method):
@@ -202,9 +202,9 @@ def refusal(block: Block, estimator: Asked) -> Note | None:
     return note("needs_moments") if estimator == "scv" and "first_ratios" not in block.columns else None
 
 
-def accumulator(asked: Asked) -> Accumulator:
+def accumulator(estimator: AnyEstimator) -> Accumulator:
     """Empty state of an estimator, for those who feed it themselves (the runner does, for stopping)."""
-    state = OwnState(asked) if isinstance(asked, OwnEstimator) else ACCUMULATORS[asked]()
+    state = OwnState(estimator) if isinstance(estimator, OwnEstimator) else ACCUMULATORS[estimator]()
     return state if isinstance(state, SeenShells) else FailureBounds(state)  # which bounds them itself
 
 
@@ -245,8 +245,8 @@ def even(blocks: Iterable[Block]) -> Iterator[Block]:
 
 def one_pass(
     blocks: Iterable[Block],
-    names: Collection[Asked] = ESTIMATORS,
-    best: Asked | None = None,
+    names: Collection[AnyEstimator] = ESTIMATORS,
+    best: AnyEstimator | None = None,
     confidence: float = 0.9,
     onset: int | None = None,
 ) -> PassResult:
@@ -259,12 +259,15 @@ def one_pass(
     if (first := next(blocks, None)) is None:
         raise ValueError("an estimate needs at least one episode")
     best = best or first.drawn.sampling.headline
-    estimators, own = {str(each): each for each in (*names, best)}, str(best)
+    estimators = {str(each): each for each in (*names, best)}
+    own = str(best)
     refusals = {name: refusal(first, estimators[name]) for name in (own, *estimators)}
     states = {name: accumulator(estimators[name]) for name, why in refusals.items() if why is None}
     empty = partial(accumulator, best)
     impacts = Impacts(empty, first.drawn.counts_above_mps) if "impact_mps" in first.columns else None
-    diagnostics, convergence, n = Diagnostics(onset), list[Point](), 0
+    diagnostics = Diagnostics(onset)
+    convergence = list[Point]()
+    n = 0
     for block in chain((first,), blocks):
         if block.first_episode != n:
             raise ValueError(f"expected a block from episode {n} on, got one from {block.first_episode}")

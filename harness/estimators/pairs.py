@@ -2,8 +2,7 @@
 
 A pair of tests has one of four outcomes: both crash, only A, only B, neither. The rates, their difference and their
 ratio are weighted sums of the shares of these outcomes, and their limits those of the likelihood ratio
-(`harness.estimators.likelihood`). Each limit takes A's failed tests for crashes and B's for none, or the other way
-round, whichever takes it farther.
+(`harness.estimators.likelihood`). Each limit takes the failed tests of A, or those of B, for crashes: the worse.
 """
 
 from __future__ import annotations
@@ -44,9 +43,8 @@ class PairDecision:
     """Whether B's rate is at most 1 + ``margin`` times A's: without a margin, who crashes less often.
 
     It holds with ``confidence``, whenever it was looked for; ``given_the_library`` it is about what lies inside.
-    ``ratio`` are the ends of B/A by which a margin was decided, None without one.
-    No margin is kept by a B with ``n_milder`` tests of which its rate says too little, nor where ``n_differing``
-    of either were not the same when they ran twice. Where A has such tests, they are ``n_milder_a``.
+    ``ratio`` are the ends of B/A by which a margin was decided. B does not keep a margin with ``n_milder`` tests of
+    which its rate says too little (A's: ``n_milder_a``), nor with ``n_differing`` tests of either.
     """
 
     margin: float | None

@@ -27,7 +27,7 @@ _GRID = 13
 """Places of each counted exposure at which the search for the outermost limit looks first; the middle is as counted."""
 
 
-class OfFamily(NamedTuple):
+class FamilyTests(NamedTuple):
     """Tests of one family, how often its events are met, and by which ``reading`` the competent driver acts.
 
     A reading is a reference driver of the library by name; where it has none so called, its first one. What is
@@ -101,7 +101,7 @@ class OfFamily(NamedTuple):
 class PerHour:
     """The sum over families; all of their strata, or those inside each library's boundary."""
 
-    def __init__(self, families: Sequence[OfFamily]) -> None:
+    def __init__(self, families: Sequence[FamilyTests]) -> None:
         self.families = tuple(families)
 
     @property
@@ -209,7 +209,8 @@ class PerHour:
             mine, theirs = family.rate, family.reference_rate
             errors += family.per_hour**2 * np.array(errors_of_paths)
             errors += design.p_event_error**2 * np.array((mine * mine, mine * theirs, theirs * theirs))
-        p, counts = np.concatenate([family.p for family in self.families]), np.concatenate(outcomes)
+        p = np.concatenate([family.p for family in self.families])
+        counts = np.concatenate(outcomes)
         return limits_over(self.reference_rate, p, counts.astype(np.float64), errors.tolist(), level)
 
     @property

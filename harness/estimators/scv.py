@@ -85,8 +85,7 @@ def with_cubes(cubes: FloatArray, rows: FloatArray) -> FloatArray:
 def _regression(factor: FloatArray, n: int) -> tuple[FloatArray, int, float]:
     """Least squares of Y on [1, H] from the factor of ``n`` rows, of the smallest norm where columns depend.
 
-    Gives intercept and β, (1 + M,), the rank of [1, H] (Σ_j alpha_j h_j = 0 always costs one), and the variance of the
-    intercept from that of the residuals.
+    Gives intercept and β, (1 + M,), the rank of [1, H] (Σ_j alpha_j h_j = 0 costs one), and the intercept's variance.
     """
     left, singular, right = np.linalg.svd(factor[:, :-1])
     rank = int(np.count_nonzero(singular > max(n, len(right)) * np.finfo(np.float64).eps * singular[0]))
@@ -109,7 +108,8 @@ class Scv(Nade):
         """Hand each episode to its stratum, in index order."""
         first_ratios, n_control_steps = block.first_ratios, block.n_control_steps
         super().add(block)
-        y, n_surrogates = block.weighted_crashes(), first_ratios.shape[2]
+        y = block.weighted_crashes()
+        n_surrogates = first_ratios.shape[2]
         order = np.argsort(n_control_steps, kind="stable")
         levels, starts = np.unique(n_control_steps[order], return_index=True)
         parts = list(zip(levels.tolist(), np.split(order, starts[1:]), strict=True))
@@ -166,8 +166,7 @@ class Scv(Nade):
 class StratumFit(NamedTuple):
     """Regression of Y_l on H_l: episodes, columns, rank of the centred columns, η_l, Σ(Z - η_l)² and Σ(Y - η_l)².
 
-    ``means`` (d,) are of the columns, ``beta`` (k, d) of as many of their largest principal components as leave so many
-    tests to each.
+    ``means`` (d,) are of the columns; ``beta`` (k, d) are fits on the largest principal components, one for each k.
     """
 
     n: int
@@ -243,7 +242,8 @@ class Stratum:
         centred, target = factor[1:last, 1:last], factor[1:last, last]
         residual_squares = float(factor[last, last] ** 2) if len(factor) > last else 0.0
         total_squares = residual_squares + float(np.sum(target**2))
-        rank, beta = 0, np.zeros((len(tests_each), last - 1))
+        rank = 0
+        beta = np.zeros((len(tests_each), last - 1))
         if centred.size:
             left, singular, right = np.linalg.svd(centred, full_matrices=False)
             largest = max(singular[0], np.linalg.norm(factor[0, :-1]))

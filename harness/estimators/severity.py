@@ -43,8 +43,7 @@ class Severity:
     """Impact speeds of the crashes, each counted by what it adds to the rate.
 
     ``median_mps`` and ``p95_mps`` are quantiles of the speed, ``share_below_1_mps`` and ``share_above_5_mps`` shares of
-    the rate; ``exceedance`` has a row for each of `SPEEDS_MPS` above what is counted. Of shells there are ``limits`` of
-    the shares.
+    the rate, with ``limits`` in runs of shells; ``exceedance`` has a row for each of the `SPEEDS_MPS` that count.
     """
 
     median_mps: float

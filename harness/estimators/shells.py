@@ -75,10 +75,7 @@ class Shell:
 
 @dataclass(frozen=True)
 class Within:
-    """The rate given that there are no crashes outside the library's boundary, and what is known of those.
-
-    ``refuted_by`` are the first few tests (episodes) that crashed outside.
-    """
+    """The rate if nothing crashes outside the library's boundary; ``refuted_by`` are the first tests that did."""
 
     boundary: str
     n_shells: int
@@ -231,10 +228,7 @@ class SeenShells:
         return self._limits(self.design.n_within(statement), level)
 
     def expected(self, limit: float, driver: str | None, statement: str) -> float:
-        """Crashes that the tests of a statement's strata would have brought at a limit, spread evenly over them.
-
-        The limit is a crash rate, or a multiple of a reference ``driver``'s.
-        """
+        """Crashes that a statement's tests would have brought at a limit: a rate, or a multiple of a ``driver``'s."""
         design, strata = self.design, slice(0, self.design.n_within(statement))
         if driver is not None:
             limit *= float(design.reference_rate[self._reference(driver)])
@@ -255,7 +249,8 @@ class SeenShells:
 
         Baseline runs are ``more_runs`` times as many. It is 1 if these tests are enough, infinite beyond a million.
         """
-        n, width = self.design.n_within(statement), 2.0 * rhw * self.limits(level, statement).rate
+        n = self.design.n_within(statement)
+        width = 2.0 * rhw * self.limits(level, statement).rate
         times = 1.0
         p, tally = self.design.p[:n], self.tally.part(slice(0, n))
         variance = pool_variance(p, tally, self.design.n_independent) / more_runs

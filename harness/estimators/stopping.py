@@ -58,8 +58,7 @@ Ended = Literal["rhw", "accept", "below_reference"]
 def decision_level(expected: float, confidence: float) -> Level:
     """The level at which one look decides, so that all looks together err in (1 - confidence)/2 of campaigns a side.
 
-    ``expected`` crashes see `DECISION_THRESHOLDS`. The threshold is the same for few crashes and many; the pool's error
-    has the quantile that belongs to it.
+    ``expected`` crashes see `DECISION_THRESHOLDS`; few and many have the same threshold, the pool's error its quantile.
     """
     threshold = next(threshold for most, threshold in DECISION_THRESHOLDS if expected < most)
     threshold = max(threshold + math.log(2.0 * DECISION_TAIL / (1.0 - confidence)), 0.5)
@@ -70,13 +69,12 @@ def decision_level(expected: float, confidence: float) -> Level:
 class Decision:
     """What is known about a limit of the crash rate, by an interval that allows for every look.
 
-    ``limit`` is in crashes per test, or in crash rates of a reference ``driver``, as are ``low`` and ``high``, between
-    which the rate lies after ``n_episodes`` tests. Even where the limit is the rate itself, at most 1 - ``confidence``
-    of campaigns take the wrong side, whatever the budget.
-    With ``n_milder`` crashes on events too mild to count, or before events, or events that the vehicle itself made
-    milder, nothing is accepted; nor with ``n_differing`` tests that were not the same when they ran twice; nor where it
-    takes ``n_runs`` baseline runs (0: there are enough) to see what the vehicle does in one of many drives.
-    ``over_assumed`` are the outermost ``low`` and ``high`` over assumed exposures, of a decision about a sum.
+    ``limit``, ``low`` and ``high`` are in crashes per test, or in crash rates of a reference ``driver``; after
+    ``n_episodes`` tests the rate lies between the latter two. Whatever the budget, at most 1 - ``confidence`` of
+    campaigns decide wrongly, even where the limit is the rate itself. Nothing is accepted with ``n_milder`` crashes
+    before events, or on events too mild to count or made milder by the vehicle; with ``n_differing`` tests that were
+    not the same when run twice; or where ``n_runs`` baseline runs (0: there are enough) are needed to see what it does
+    in one of many drives. ``over_assumed`` are the outermost ``low`` and ``high`` of a sum over assumed exposures.
     """
 
     limit: float
@@ -108,10 +106,9 @@ class Decision:
 class Look:
     """What a rule has found at its last look; a relative half-width is infinite where the interval may be wrong.
 
-    ``ended`` is which end was reached, if any. ``unmet`` are conditions that were not met when a look last failed: what
-    decided, or what is still missing. ``pool_error_above_target`` says that no test would help: the pool's own error is
-    too large for the asked precision; ``rhw_from_pool`` is what it alone would leave, 0 while little is known.
-    ``decision`` is what is known about the limit that the campaign asks about, if it does; then that is waited for.
+    ``ended`` is which end was reached, if any; ``unmet`` are the conditions that a look last failed. With
+    ``pool_error_above_target`` no test would help: the pool's own error is too large; ``rhw_from_pool`` is what it
+    alone would leave, 0 while little is known. ``decision`` is what is known about the campaign's limit, if it has one.
     """
 
     rhw: float = math.inf
@@ -157,9 +154,8 @@ class Rule:
     ) -> bool:
         """Record a look at a precision, and say whether to stop; ``key`` is that of its note.
 
-        ``one_more_crash`` is the share by which one more crash, of the largest weight, would have moved the estimate;
-        ``also`` is what was waited for if nothing else is unmet; ``pool`` has the half-widths that the pool's own error
-        would leave alone, as it was seen, and at least.
+        ``one_more_crash`` is the share by which one more, of the largest weight, would move the estimate; ``also`` is
+        what was waited for if nothing else is unmet; ``pool`` are half-widths by the pool's error, seen and least.
         """
         if (target := self.target) is None:
             self.look = Look(rhw)
@@ -243,7 +239,8 @@ class RoundRule(Rule):
         if self._accept is not None:
             return self._decided(seen, self._accept) and n >= self._held
         level = Level.two_sided(self._confidence)
-        limits, limit = seen.limits(level, self._statement), self._below_reference
+        limits = seen.limits(level, self._statement)
+        limit = self._below_reference
         of_families = seen.families if self._each and isinstance(seen, PerHour) else ()
         rhws = [family.limits(level).rhw for family in of_families]
         also = note("first_tests") if self.of_first_tests else None
@@ -308,10 +305,9 @@ class RoundRule(Rule):
 class PairRule(Rule):
     """Looks at two vehicles after each round: who crashes less often, or whether B is worse by more than a ``margin``.
 
-    What is known of that is ``decision``. Without a margin it is enough, too, once the half-width of the difference is
-    `NARROW` of the larger rate, or both rates are below ``stop.below_reference``. An ``rhw`` that is asked for is all
-    that is waited for (``ends_at_rhw``); then a decision is looked for once. ``look.rhw`` is that half-width;
-    ``conditional`` says whether only what lies within the boundary is looked at.
+    ``decision`` is what is known of that. Without a margin it is also enough if the half-width of the difference, which
+    is ``look.rhw``, is `NARROW` of the larger rate, or if both rates are below ``stop.below_reference``. If an ``rhw``
+    is asked for it alone is waited for (``ends_at_rhw``). If ``conditional``, only pairs within the boundary count.
     """
 
     level_at = staticmethod(decision_level)
@@ -327,7 +323,8 @@ class PairRule(Rule):
 
     def observe(self, pairs: Pairs) -> bool:
         """Whether to stop at the end of a round."""
-        watched, level = pairs.within(self._statement), Level.two_sided(self._confidence)
+        watched = pairs.within(self._statement)
+        level = Level.two_sided(self._confidence)
         self.decision = replace(self.decision, verdict=self._verdict(watched))
         if self.decision.margin is not None and watched.n_crashes:
             _, low, high = watched.ratio(self._level(watched))
@@ -347,7 +344,8 @@ class PairRule(Rule):
 
     def more_pairs(self, pairs: Pairs) -> float:
         """How many times as many pairs mostly decide, if they end as often; infinite where nobody can tell."""
-        watched, times = pairs.within(self._statement), 1.0
+        watched = pairs.within(self._statement)
+        times = 1.0
         while times < MOST_TIMES:
             times *= LOOK_RATIO
             ahead = watched.times(times)

@@ -181,10 +181,11 @@ class OnRuns(NamedTuple):
     def square(self, scale: FloatArray, tally: Tally, errors: float = 0.0) -> float:
         """Estimate of the mean of G² over paths, each crash of a stratum counting ``scale`` (S,).
 
-        ``errors`` are standard errors of the variance that are added, or taken off if negative; the number of pairs
-        tells how large one is. Without a pair the mean of G² is at least the square of the mean, and has no upper end.
+        ``errors`` standard errors of the variance, which the number of pairs tells, are added, or taken off. Without a
+        pair the mean of G² has no upper end, and its lower one is the square of the mean.
         """
-        s, n = scale.size, self.n_pairs(scale > 0.0)
+        s = scale.size
+        n = self.n_pairs(scale > 0.0)
         pairs = self.pairs[:s, :s] + np.diag(self.pairs.diagonal()[:s] / np.maximum(tally.tests - 1, 1))
         square = float(scale @ self.own[:s] + self.n_runs * (scale @ pairs @ scale))
         if errors == 0.0:
@@ -247,7 +248,8 @@ def combined(p: FloatArray, tally: Tally, n_paths: float, level: Level) -> RateL
 
     The upper limit may lie above Σ p_s, the rate of a vehicle that crashes on all events: it is as uncertain as that.
     """
-    worst, variance = tally.failed_as_crashes(), pool_variance(p, tally, n_paths)
+    worst = tally.failed_as_crashes()
+    variance = pool_variance(p, tally, n_paths)
     variance_of_worst = variance if worst is tally else pool_variance(p, worst, n_paths)
     low = likelihood_limit(p, tally.crashes, tally.tests, level, -1.0, variance)
     high = likelihood_limit(p, worst.crashes, worst.tests, level, 1.0, variance_of_worst)

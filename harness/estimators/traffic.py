@@ -56,8 +56,7 @@ class Unseen:
 class TrafficError:
     """What replicates of an ``environment`` say of a rate, and of its ratios to others, by name.
 
-    Of ``n_replicates`` ``n_refused`` could not be answered; the others may be ``off`` by so much in the mean. With
-    ``unseen`` there are upper limits alone.
+    ``n_refused`` of them have no answer; the others may be ``off`` in the mean. ``unseen`` leaves upper limits alone.
     """
 
     environment: str
@@ -112,11 +111,10 @@ def _log(value: float) -> float:
 
 @dataclass(frozen=True)
 class Bar:
-    """A number, or a block, by how it is ``known``, and the factors of rate and ratio at its two ends.
+    """A number, or a block of them, by how it is ``known``, and the factors of rate and ratio at its two ends.
 
-    ``values`` are the ends, of a block none, ``off`` by how much a reference driver's rate comes out wrong at most. A
-    factor is NaN where the tests do not say it: of ``n`` environments ``no_laws`` have laws that give no probabilities,
-    and ``unlike`` are unlike what was tested.
+    ``values`` are the ends, None for a block; ``off`` is by how much a reference driver's rate comes out wrong at most.
+    A factor is NaN if no test tells it: of ``n`` environments ``no_laws`` have no laws, ``unlike`` were not tested.
     """
 
     what: str

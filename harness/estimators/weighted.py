@@ -129,8 +129,7 @@ class Nade:
     def cap(self) -> tuple[float, CapKind]:
         """Largest Y that the tests could have had, whatever the AV does, and what that rests on: else infinite.
 
-        Where the design has none it is taken over all tests driven (`Block.log_cap`), the few that ended in a crash and
-        the many that did not.
+        Where the design has none it is that of all tests driven (`Block.log_cap`), with a crash or without.
         """
         if math.isfinite(self._design_cap):
             return max(self._design_cap, self._largest_y), "design"

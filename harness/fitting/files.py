@@ -16,7 +16,7 @@ from harness.arguments import AtLeastTwo, checked
 from harness.errors import HarnessError, printable
 from harness.families import families
 from harness.fitting.distinct import fingerprint, require_distinct
-from harness.fitting.protocol import Asked, Fitted, Fitter
+from harness.fitting.protocol import FitRequest, Fitted, Fitter
 from harness.fitting.table import load_mapping, recordings
 from harness.progress import Progress
 from harness.records.folder import require_place, write_together
@@ -97,7 +97,8 @@ def fit_files(
     require_place(out.parent)
 
     progress.stage("reading trajectories", 1000)
-    done, fingerprints = 0, []
+    done = 0
+    fingerprints = []
     for recording in recordings(paths, columns):
         fingerprints.append(fingerprint(recording))
         for fitter in fitters.values():
@@ -105,7 +106,7 @@ def fit_files(
         progress.advance(round(1000 * recording.share_read) - done)
         done = round(1000 * recording.share_read)
     require_distinct(fingerprints)
-    asked = Asked(paths, mapping, columns, out, n_replicates, seed, progress)
+    asked = FitRequest(paths, mapping, columns, out, n_replicates, seed, progress)
     fitted: dict[str, Fitted] = {}
     for name, fitter in reversed(fitters.items()):
         fitted = {name: fitter.fitted(asked, fitted), **fitted}

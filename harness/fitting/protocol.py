@@ -12,7 +12,7 @@ from harness.fitting.table import Mapping as Columns
 from harness.progress import Progress
 
 
-class Asked(NamedTuple):
+class FitRequest(NamedTuple):
     """What is fitted: ``files`` read by a mapping, to a file ``out`` and ``n_replicates`` drawn by the ``seed``."""
 
     files: Sequence[Path]
@@ -49,8 +49,5 @@ class Fitter(Protocol):
     def observe(self, recording: Recording) -> None:
         """Keep what it needs of a recording."""
 
-    def fitted(self, asked: Asked, others: Mapping[str, Fitted]) -> Fitted:
-        """What was found; ``others`` are families that come after it, which a page may show as well.
-
-        Raises `TrajectoryError`: nothing can be.
-        """
+    def fitted(self, asked: FitRequest, others: Mapping[str, Fitted]) -> Fitted:
+        """What was found, or a `TrajectoryError`; ``others`` are families that come after it, for its page."""

@@ -82,8 +82,8 @@ def require(rule: ColumnRule, rows: pd.DataFrame, where: Callable[[int], str]) -
 class Recording:
     """All vehicles on a stretch of road during some time: rows (n,), sorted by vehicle and time.
 
-    ``vehicle`` numbers the identifiers ``vehicles``, ``row`` is that of the file, from 1; ``lane`` is smoothed, and was
-    left for less than a second ``flickers`` times. ``share_read`` is that of the bytes or rows of all files so far.
+    ``vehicle`` numbers the identifiers ``vehicles``; ``row`` is that in the file, from 1; ``lane`` is smoothed: it was
+    left for less than a second ``flickers`` times. ``share_read`` is the share of all files that has been read so far.
     """
 
     name: str
@@ -177,7 +177,8 @@ def recording_of(name: str, file: str, rows: pd.DataFrame, share_read: float) ->
     """
     code, identifiers = pd.factorize(rows.vehicle_id)
     order = np.lexsort((rows.time_s, code))
-    rows, code = rows.drop(columns=NAMES, errors="ignore").iloc[order].reset_index(drop=True), code[order]
+    rows = rows.drop(columns=NAMES, errors="ignore").iloc[order].reset_index(drop=True)
+    code = code[order]
     time_s = rows.time_s.to_numpy()
     dt = np.diff(time_s)
     same = np.diff(code) == 0
@@ -229,7 +230,8 @@ def _check_motion(recording: Recording, rows: pd.DataFrame) -> None:
     driven_m = np.append(0.0, np.cumsum(0.5 * (v[1:] + v[:-1]) * np.diff(frame) / rate))
     begin = np.arange(max(s.size - n, 0))
     begin = begin[(vehicle[begin] == vehicle[begin + n]) & (frame[begin + n] == frame[begin] + n)]
-    way_m, of_speeds_m = s[begin + n] - s[begin], driven_m[begin + n] - driven_m[begin]
+    way_m = s[begin + n] - s[begin]
+    of_speeds_m = driven_m[begin + n] - driven_m[begin]
     ratio = _ratio(way_m, of_speeds_m)
     if abs(ratio - 1.0) > OF_STEP:
         found = f"speeds {ratio:.3g} times the change of positions"

@@ -80,7 +80,8 @@ def recordings(files: Sequence[str | Path], mapping: Mapping) -> Iterator[Record
         raise TrajectoryError(where, "no file with tracks", "NN_tracks.csv", "Give highD's tracks as well.")
     names_seen: dict[str, set[str]] = {"recording": set(), "class": set()}
     for i, path in enumerate(track_files):
-        table, n_read = _read(path, mapping), 0
+        table = _read(path, mapping)
+        n_read = 0
         for name, rows in table.groupby("recording_id", sort=False):
             n_read += len(rows)
             names_seen["recording"].add(str(name))
@@ -145,7 +146,8 @@ def _read(path: Path, mapping: Mapping) -> pd.DataFrame:
             types = {name: pa.string() if column in NAMES else pa.float64() for column, name in columns.items()}
             read = pa.csv.ReadOptions(column_names=names, skip_rows=first - 1, block_size=1 << 22)
             wanted = {"column_types": types, "include_columns": list(types), "decimal_point": decimal_point}
-            parse, convert = pa.csv.ParseOptions(delimiter=delimiter), pa.csv.ConvertOptions(**wanted)
+            parse = pa.csv.ParseOptions(delimiter=delimiter)
+            convert = pa.csv.ConvertOptions(**wanted)
             table = pa.csv.read_csv(content, read, parse, convert)
         if not len(table):
             raise TrajectoryError(str(path), "no rows", "one row per vehicle and time", "Is it the right file?")
@@ -153,10 +155,7 @@ def _read(path: Path, mapping: Mapping) -> pd.DataFrame:
 
 
 def _text(path: Path, mapping: Mapping) -> tuple[Any, list[str], str, str, int]:
-    """How a text file is written: content in UTF-8, names, delimiter, decimal sign, and the row of its first values.
-
-    What is packed is unpacked as it is read.
-    """
+    """How a text file is written: unpacked content, names, delimiter, decimal sign, and the row of the first values."""
     sample = pa.input_stream(str(path)).read(SAMPLE)
     if b"\0" in sample:
         found = "zero bytes, as in an Excel workbook, in what is packed, or in text that is not UTF-8"

@@ -101,14 +101,13 @@ class Speed:
 class AvCheck(ShownInPython):
     """What a few dozen episodes say about an AV, run on an engine with events that a method brought about.
 
-    ``failures`` are numbers of episodes of the first run by the cause that they failed with, where one stands for all
-    that differ from it in digits alone; ``differing`` are those whose motion was not the same bits in the two layouts,
-    with the ``likely_cause`` if there are any, and where a clock was read; ``limits_mps2`` are the accelerations that
-    count as its limits; ``moved_mps2`` says by how much first answers move at most if the warm-up takes so many seconds
-    (key) instead of ``av.warm_up_s``. The built-in IDM has driven the same episodes in the same cells. Cut-ins are of
-    one step, also where they ``show`` before in the campaign, for a vehicle that acts before them: a look makes no
-    baseline runs, which would tell the onset. ``events`` are what the scenario calls them; where the AV follows from
-    the start, ``follows`` says how.
+    ``failures`` are numbers of failed episodes by cause, where causes that differ in digits alone are one;
+    ``differing`` are episodes whose motion was not the same bits in two layouts, with their ``likely_cause`` and where
+    a clock was read; ``limits_mps2`` are the accelerations that count as its limits; ``moved_mps2`` is by how much
+    first answers move at most if the warm-up takes so many seconds (key) instead of ``av.warm_up_s``. The built-in IDM
+    drives the same episodes. A vehicle that acts before the event meets cut-ins of one step also where those of the
+    campaign take time (``shows``), as a look makes no baseline runs. ``events`` is their name; ``follows`` says how the
+    AV follows from the start.
     """
 
     source: str

@@ -84,7 +84,8 @@ def crash_gallery(run: RunFolder, summary: RunSummary) -> tuple[list[GalleryRow]
         chosen = sorted(enumerate(ranked, 1), key=lambda item: episode[item[1]] not in traced)[:SHOWN]
         for rank, place in sorted(chosen):
             reasons.setdefault(place, []).append(f"{reason} no. {rank}")
-    total, stored = float(crashes["weight"].sum()), run.crashes({int(episode[place]) for place in reasons} & traced)
+    total = float(crashes["weight"].sum())
+    stored = run.crashes({int(episode[place]) for place in reasons} & traced)
     rows, shown = list[GalleryRow](), list[Scene]()
     # Shells, or importance functions, of which the forced event is the first.
     names = ["forced", *run.campaign.surrogates] if run.shells is None else [each.shell for each in run.shells.shells]
@@ -111,10 +112,10 @@ def crash_gallery(run: RunFolder, summary: RunSummary) -> tuple[list[GalleryRow]
 def _rankings(summary: RunSummary, stand_in: str, avoided: BoolArray, someone: BoolArray) -> dict[str, list[int]]:
     """Places of crashes by what they are shown for.
 
-    ``avoided`` (n, D) says which drivers avoid them, the first of whom is the ``stand_in``; ``someone`` (n,) whether
-    any of them may have.
+    ``avoided`` (n, D) says which drivers avoid them, the ``stand_in`` first; ``someone`` (n,) whether any of them may.
     """
-    crashes, among = summary.crashes, someone if someone.any() else ~someone
+    crashes = summary.crashes
+    among = someone if someone.any() else ~someone
     episode, impact, weight = (crashes[name] for name in ("episode", "impact_speed_mps", "weight"))
     all_known = someone.any() and (avoided.any(1) == someone).all()
     hardest = "hardest avoidable" if all_known else "hardest"
@@ -167,18 +168,18 @@ class CrashPairs(NamedTuple):
 def crashing_pairs(runs: Sequence[RunFolder], shells: Sequence[dict[str, Any]]) -> CrashPairs:
     """Pairs on which A or B crashes, by the records: the i-th test of a shell of A and of B."""
     axes = runs[0].family.maps[0]
-    n_pairs, columns = [shell["n_pairs"] for shell in shells], []
+    n_pairs, tests = [shell["n_pairs"] for shell in shells], []
     for run in runs:
         rows = summarise(run).rows
         paired = [np.flatnonzero(rows["component"] == s)[:n] for s, n in enumerate(n_pairs)]
-        if [each.size for each in paired] != n_pairs:
+        if [side.size for side in paired] != n_pairs:
             raise RunFolderError(str(run.path), "fewer tests than pairs", f"those of {COMPARISON}", COMPARE_AGAIN)
-        columns.append({name: column[np.concatenate(paired)] for name, column in rows.items()})
-    a, b = (each["outcome"] == CRASH for each in columns)
+        tests.append({name: column[np.concatenate(paired)] for name, column in rows.items()})
+    a, b = (side["outcome"] == CRASH for side in tests)
     crashed = a | b
-    values = np.stack([np.where(a, axis.of(columns[0]), axis.of(columns[1]))[crashed] for axis in axes])
-    episode = np.stack([np.where(each["outcome"] == FAILED, -1.0, each["episode"])[crashed] for each in columns])
-    impact = np.stack([each["impact_speed_mps"][crashed] for each in columns])
+    values = np.stack([np.where(a, axis.of(tests[0]), axis.of(tests[1]))[crashed] for axis in axes])
+    episode = np.stack([np.where(side["outcome"] == FAILED, -1.0, side["episode"])[crashed] for side in tests])
+    impact = np.stack([side["impact_speed_mps"][crashed] for side in tests])
     weight = np.repeat(weight_of_a_test(np.array([shell["p"] for shell in shells]), np.array(n_pairs)), n_pairs)
     who = np.where(a & b, 0, np.where(a, 1, 2))[crashed]
     return CrashPairs(who, weight[crashed], values, episode.astype(np.int64), impact)

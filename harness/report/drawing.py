@@ -123,7 +123,8 @@ class PlotPanel:
         bottom, middle = top + height, left + width / 2.0
         parts = [f'<text y="12" style="fill:var(--ink);font-weight:600">{escape(self.title)}</text>']
         for mark, row, x in legend:
-            place, label = f"translate({x:.0f},{28.0 + LINE * row:.0f})", escape(mark.label)
+            place = f"translate({x:.0f},{28.0 + LINE * row:.0f})"
+            label = escape(mark.label)
             parts.append(f'<g transform="{place}">{_swatch(mark)}<text x="20" y="4">{label}</text></g>')
         for value, text in self.x.ticks():
             x = left + width * float(self.x.place(value))
@@ -167,8 +168,7 @@ class PlotPanel:
 class Plot:
     """Panels with what a reader needs beside them.
 
-    ``name`` is its file's, without suffix; ``alt`` says what it shows to those who cannot see it, ``caption`` what to
-    read from it.
+    ``name`` is its file's, without suffix; ``alt`` says what it shows, ``caption`` what to read from it.
     """
 
     name: str

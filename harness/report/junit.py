@@ -22,10 +22,7 @@ OUTCOMES: Mapping[int, Outcome] = {EXIT_DONE: "passed", EXIT_BUDGET_SPENT: "erro
 
 @dataclass(frozen=True)
 class Case:
-    """A statement: its name, what it says, and what that means for a gate.
-
-    An ``error`` is a question left open, as by a spent budget.
-    """
+    """A gate's case: its name, what it says, and the outcome; an ``error`` is a question left open."""
 
     name: str
     message: str
@@ -34,7 +31,7 @@ class Case:
     """In one line; by default the message's second row, below what was tested."""
 
 
-def statement_case(content: dict[str, Any], message: str, asked: str, exit_code: int) -> Case:
+def statement_case(content: dict[str, Any], message: str, statement: str, exit_code: int) -> Case:
     """Case of an answer, which the ``message`` tells: the statement that was asked about decides.
 
     It fails where a test has refuted it. Where there is no such statement, as under other methods than shells, the
@@ -44,7 +41,7 @@ def statement_case(content: dict[str, Any], message: str, asked: str, exit_code:
     if "families" not in content:
         name, answer = "crash rate", content["estimates"][content["headline"]]
         within = answer.get("details", {}).get("within") or {}
-    asks = bool(within) and asked == LIBRARY_STATEMENT
+    asks = bool(within) and statement == LIBRARY_STATEMENT
     outcome = "failure" if asks and within["refuted"] else OUTCOMES.get(exit_code, "failure")
     if (decision := content.get("decision")) is not None:
         name += f" below {limit_words(decision)}"

@@ -1,8 +1,7 @@
 """An episode as OpenSCENARIO XML 1.2 on an OpenDRIVE road, by scenariogeneration (extra ``harness[export]``).
 
 Every vehicle follows a polyline with a point for each step of 0.1 s, so that a player shows what was simulated and
-decides nothing. A vehicle that changes lanes goes on sideways as fast as it began; only one that does so in one step
-crosses the lane within 0.1 s.
+decides nothing. A lane change goes on sideways as fast as it began; one of a single step takes 0.1 s.
 """
 
 from __future__ import annotations
@@ -65,9 +64,8 @@ def _positions(track: pa.Table) -> list[xosc.WorldPosition]:
 def _car(name: str) -> xosc.Vehicle:
     centre_m, between_wheels_m = VEHICLE_LENGTH_M / 2.0 - OVERHANG_M, WIDTH_M - WHEEL_M / 2.0
     box = xosc.BoundingBox(WIDTH_M, VEHICLE_LENGTH_M, HEIGHT_M, centre_m, 0.0, HEIGHT_M / 2.0)
-    front, rear = (
-        xosc.Axle(turn, WHEEL_M, between_wheels_m, at, WHEEL_M / 2.0) for turn, at in ((0.5, AXLES_M), (0.0, 0.0))
-    )
+    front = xosc.Axle(0.5, WHEEL_M, between_wheels_m, AXLES_M, WHEEL_M / 2.0)
+    rear = xosc.Axle(0.0, WHEEL_M, between_wheels_m, 0.0, WHEEL_M / 2.0)
     return xosc.Vehicle(name, xosc.VehicleCategory.car, box, front, rear, FASTEST_MPS, HARDEST_MPS2, HARDEST_MPS2)
 
 
@@ -75,7 +73,8 @@ def _follows(name: str, positions: list[xosc.WorldPosition]) -> xosc.Maneuver:
     line = xosc.Trajectory(f"motion of {name}", closed=False)
     line.add_shape(xosc.Polyline((np.arange(len(positions)) * STEP_S).round(1).tolist(), positions))
     action = xosc.FollowTrajectoryAction(line, xosc.FollowingMode.position, xosc.ReferenceContext.absolute, 1.0, 0.0)
-    event, maneuver = xosc.Event(f"{name} moves", xosc.Priority.override), xosc.Maneuver(f"{name} moves")
+    event = xosc.Event(f"{name} moves", xosc.Priority.override)
+    maneuver = xosc.Maneuver(f"{name} moves")
     event.add_action(f"{name} follows its motion", action)
     event.add_trigger(_at(0.0, "start"))
     maneuver.add_event(event)

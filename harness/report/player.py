@@ -87,7 +87,8 @@ class Scenes:
         self, environment: Environment, rows: pa.Table, traces: pa.Table | None, *, last: bool = False
     ) -> Driven:
         """What the stand-ins do in these episodes; with the motion in the ``last`` of them."""
-        chosen, start = chosen_from(rows, self._family), np.full((rows.num_rows, 2), np.nan)
+        chosen = chosen_from(rows, self._family)
+        start = np.full((rows.num_rows, 2), np.nan)
         if traces is not None:
             episode, step, x, v = (floats(_rows_of(traces, "AV").column(name)) for name in ("episode", "step", *MOTION))
             row = np.searchsorted(floats(rows.column("episode")), episode)
@@ -169,8 +170,7 @@ class Scenes:
 def beside_other(scene: Scene, label: str, other: str, trace: pa.Table | None) -> Scene:
     """The scene of a crash of the vehicle ``label``, with the ``other`` as a ghost, which did not crash on this event.
 
-    The scene has no ghosts before. The vehicle ahead goes on after the crash as in the other's test, if that was
-    traced.
+    The scene has no ghosts yet. The vehicle ahead goes on after the crash as in the other's test, if that was traced.
     """
     first, av, ghosts = scene["first"], scene["tracks"][-1], list[Scene]()
     bv = scene["tracks"][family_named(scene["scenario"]).principal]
@@ -197,7 +197,7 @@ def _states(rows: pa.Table) -> dict[str, Any]:
 def with_lateral(row: pa.Table, trace: pa.Table, family: Family, environment: Environment | None) -> pa.Table:
     """The trace of an episode with ``lateral_m``, how far the vehicle that leaves its lane has moved sideways.
 
-    Where a vehicle comes over the records have it already; where the environment is not known it is left out.
+    Records have it already where vehicles come over; where the environment is not known it is left out.
     """
     if environment is None or "lateral_m" in trace.column_names or not row.column("event_step")[0].is_valid:
         return trace

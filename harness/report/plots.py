@@ -78,7 +78,8 @@ def convergence_plot(run: RunFolder) -> Plot | None:
     left.add("line", "blue", n, rate, label="estimate")
     left.add("line", "muted", n[[0, -1]], rate[[-1, -1]], dash=DASHED, width=1.0, label="at the end")
     right = _rhw_panel(tests, n, rhw, None if of_library else target)
-    caption, ending = WEIGHTED if estimates.headline != "shells" else IN_ROUNDS, f", ending at {number(rhw[-1])}"
+    caption = WEIGHTED if estimates.headline != "shells" else IN_ROUNDS
+    ending = f", ending at {number(rhw[-1])}"
     if right is None:
         caption, ending = caption.partition(" RHW")[0], ": not known"
     elif target is None:
@@ -102,10 +103,10 @@ def _rate_limit(rate: FloatArray, high: FloatArray) -> float:
 
 
 def _rhw_panel(tests: PlotAxis, n: FloatArray, rhw: FloatArray, target: float | None) -> PlotPanel | None:
-    known = np.isfinite(rhw) & (rhw > 0.0)
-    if not known.any():
+    finite = np.isfinite(rhw) & (rhw > 0.0)
+    if not finite.any():
         return None
-    n, rhw = n[known], rhw[known]
+    n, rhw = n[finite], rhw[finite]
     shown = rhw if target is None else np.append(rhw, target)
     y = PlotAxis("RHW", float(shown.min()) / 1.5, float(shown.max()) * 1.6, log=True)
     panel = PlotPanel("Relative half-width (RHW)", tests, y)
@@ -118,14 +119,17 @@ def _rhw_panel(tests: PlotAxis, n: FloatArray, rhw: FloatArray, target: float | 
 
 def shells_plot(shown: ShownShells) -> Plot:
     """Draw contribution with its limits (left) and half-width (right), from careful to careless."""
-    shells, names = shown.shells, (*(shell.shell for shell in shown.shells), POOL)
+    shells = shown.shells
+    names = (*(shell.shell for shell in shown.shells), POOL)
     pool = float(np.nan_to_num(shown.pool_half_width))  # NaN where it is not known: there is no interval then
     half_widths = np.array([*(shell.half_width for shell in shells), pool])
     # An untested shell may hold anything up to its probability: it would flatten all others, and runs out instead.
     tested = [shell for shell in shells if shell.n_episodes] or list(shells)
     limit = 1.12 * max(shell.high for shell in tested)
     widest = 1.3 * max(*(shell.half_width for shell in tested), pool)
-    rows, y, height = np.arange(len(names)), PlotAxis("", len(names) - 0.4, -0.6, names=names), 62.0 + 26.0 * len(names)
+    rows = np.arange(len(names))
+    y = PlotAxis("", len(names) - 0.4, -0.6, names=names)
+    height = 62.0 + 26.0 * len(names)
     adds = PlotAxis("contribution to the crash rate, per test", 0.0, limit)
     left = PlotPanel("Where the rate comes from", adds, y, height=height)
     right = PlotPanel("Where the uncertainty lies", PlotAxis("half-width, per test", 0.0, widest), y, height=height)
@@ -169,20 +173,18 @@ def sensitivity_plot(sensitivity: Sensitivity) -> Plot:
     ends = np.array([[np.nanmin(factors), np.nanmax(factors)] for factors in moved])
     rate, ratio = ends[0::2].T, ends[1::2].T
     low, high = 0.9 * float(max(ends[:, 0].min(), 1e-3)), 1.1 * float(ends[:, 1].max())
-    rows, known = np.arange(len(names)), np.array([bar.known for bar in shown])
-    y = PlotAxis("", len(names) - 0.4, -0.6, names=names)
-    panel = PlotPanel(
-        "What moves the answer", PlotAxis("times", low, high, log=True), y, height=76.0 + 22.0 * len(names)
-    )
+    rows, provenance = np.arange(len(names)), np.array([bar.known for bar in shown])
+    across, down = PlotAxis("times", low, high, log=True), PlotAxis("", len(names) - 0.4, -0.6, names=names)
+    panel = PlotPanel("What moves the answer", across, down, height=76.0 + 22.0 * len(names))
     for name, colour in KNOWN.items():
-        if (kind := known == name).any():
-            left, at = np.maximum(rate[0][kind], low), rows[kind]
-            panel.add("boxes", colour, left, rate[1][kind], at - 0.3, at + 0.3, opacity=0.85, label=f"rate, {name}")
+        if (kind := provenance == name).any():
+            left, y = np.maximum(rate[0][kind], low), rows[kind]
+            panel.add("boxes", colour, left, rate[1][kind], y - 0.3, y + 0.3, opacity=0.85, label=f"rate, {name}")
     thin = rows - 0.06, rows + 0.06
     # What moves the rate most need not move the ratio most.
     first, most = (int(np.abs(np.log(np.maximum(factors, low))).max(axis=0).argmax()) for factors in (rate, ratio))
     panel.add("boxes", "ink", np.maximum(ratio[0], low), ratio[1], *thin, label=f"its ratio to {sensitivity.driver}")
-    panel.add("line", "muted", [1.0, 1.0], [y.low, y.high], dash=DASHED, width=1.0)
+    panel.add("line", "muted", [1.0, 1.0], [down.low, down.high], dash=DASHED, width=1.0)
     text = (
         "Fitted and counted numbers move over nine tenths of what their data leave open, assumed ones over the stated "
         f"range. The rate depends most on {names[first]}: × {number(rate[0][first], 2)} to × "
@@ -253,16 +255,13 @@ def _map(axes: tuple[Shown, Shown], rows: Mapping[str, FloatArray], met: BoolArr
 
 
 def pairs_plot(who: IntArray, weight: FloatArray, values: FloatArray, family: Family) -> Plot | None:
-    """Map of the events (n,) on which a vehicle crashes, by ``who`` of `WHO`; None without any.
-
-    ``values`` (2, n) are those of the axes of the family's first map.
-    """
+    """Map of events (n,) that crash, by ``who`` of `WHO`, at ``values`` (2, n) of the family's first map; or None."""
     (first, second), words = family.maps[0], family.words
-    known = np.isfinite(values).all(axis=0)  # one that crashes before the event has met none
-    if not known.any():
+    met = np.isfinite(values).all(axis=0)  # one that crashes before the event has met none
+    if not met.any():
         return None
-    weight, values = weight[known], values[:, known]
-    cells = np.stack((who[known], values[0] // first.cell, values[1] // second.cell))
+    weight, values = weight[met], values[:, met]
+    cells = np.stack((who[met], values[0] // first.cell, values[1] // second.cell))
     (kind, *_), place = np.unique(cells, axis=1, return_inverse=True)
     place = place.ravel()  # numpy 2.0 gives it another axis
     adds = np.bincount(place, weight)
@@ -272,7 +271,8 @@ def pairs_plot(who: IntArray, weight: FloatArray, values: FloatArray, family: Fa
     panel = PlotPanel(f"{words.events.capitalize()} that crash, by who crashes", across, up, height=300.0)
     shares = []
     for code, (name, colour) in enumerate(WHO.items()):
-        own, n = kind == code, count(int(np.count_nonzero(who == code)))
+        own = kind == code
+        n = count(int(np.count_nonzero(who == code)))
         radius = LARGEST * np.sqrt(adds[own] / adds.max())
         panel.add("dots", colour, gap[own], closing[own], radius, opacity=0.7, label=f"{name} ({n})")
         shares.append(f"{name} on {n}")

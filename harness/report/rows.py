@@ -150,9 +150,9 @@ def decided(decision: Mapping[str, Any]) -> Row:
     }.get(verdict, (f"limit {limit}", open_above if decision["high"] is None else f"it may be {low} to {high}"))
     if held_back(decision):
         value, ends = f"rate below {limit}", "yet not accepted, see !"
-    given = "" if decision["statement"] == ASSUMPTION_FREE else f", given {decision['statement']}"
+    condition = "" if decision["statement"] == ASSUMPTION_FREE else f", given {decision['statement']}"
     return Row(
-        "verdict", verdict.upper(), value, f"confidence {plain(decision['confidence'])} over all looks{given}", ends
+        "verdict", verdict.upper(), value, f"confidence {plain(decision['confidence'])} over all looks{condition}", ends
     )
 
 

@@ -280,7 +280,8 @@ def pair_lines(
     """A comparison (``compare.json``) for a terminal, as short as `lines`; ``s_per_pair`` is the time of a pair (s)."""
     asked, rows = pair_asked(content), []
     for name in "AB":
-        rates, label = rates_of(content[name.lower()]), content["campaigns"][name.lower()]["label"]
+        rates = rates_of(content[name.lower()])
+        label = content["campaigns"][name.lower()]["label"]
         label = label.removeprefix(f"{content['campaigns']['a']['label']}, ").replace("av.parameters.", "")
         rate, ends = number(rates["rate"]), interval(rates["ci_low"], rates["ci_high"], beside=rates["rate"])
         if not (n := rates["n_crashes"]):

@@ -55,10 +55,7 @@ class ShownShells(ShellDetails):
 
 @dataclass(frozen=True)
 class RunFolder:
-    """A finished run: its campaign, manifest, estimates and tests; ``design`` is None where these were not of shells.
-
-    ``traffic`` is None where that can no longer be driven in.
-    """
+    """A finished run; ``design`` is None if its tests are not of shells, ``traffic`` if that cannot be driven in."""
 
     path: Path
     campaign: Campaign
@@ -88,19 +85,18 @@ class RunFolder:
 
 
 def typed(path: Path) -> str:
-    """A folder as commands on its page name it: relative to the working directory, or its bare name.
+    """A folder as commands on its page name it: relative to the working directory, or by its bare name.
 
-    The bare name stands for a folder that is not below it. An absolute path would say where somebody keeps their files
-    to everybody whom the page is mailed to.
+    An absolute path would tell everybody whom the page is mailed to where somebody keeps their files.
     """
     here, absolute = Path.cwd(), Path(os.path.abspath(path))  # noqa: PTH100 - resolve() would follow links
     return shlex.quote(str(absolute.relative_to(here)) if absolute.is_relative_to(here) else absolute.name)
 
 
-def read_run_folder(path: Path, told: dict[str, Any] | None = None) -> RunFolder:
-    """Read campaign, manifest, tests and, where they are not ``told``, estimates of a run."""
+def read_run_folder(path: Path, content: dict[str, Any] | None = None) -> RunFolder:
+    """Read campaign, manifest, tests and, where they are not ``content``, estimates of a run."""
     manifest = read_manifest(path)
-    estimates = STORED_ESTIMATES.validate_python(told or _read_estimates(path, manifest["campaign_hash"]))
+    estimates = STORED_ESTIMATES.validate_python(content or _read_estimates(path, manifest["campaign_hash"]))
     campaign = read_campaign(path, manifest)
     tests = ShownTests.stored(path, manifest, family_named(campaign.scenario))
     design = stored_design(path) if campaign.sampling.strata else None
@@ -136,11 +132,10 @@ def _shells(folder: Path, headline: Estimate, design: ShellDesign) -> ShownShell
 class RunSummary:
     """Counts and weights of a run's tests, and the columns of those that plots need.
 
-    ``count``, ``weight`` (5,) are episodes and sum of weights per outcome, in the order of `OUTCOMES`; ``causes`` are
-    failed episodes per kind of cause. A weight is what a test adds to the sum that is the estimate: its likelihood
-    ratio or, of tests from shells, p_s/n_s. Failed tests are counted and have no weight. ``rows`` (m,) are ``outcome``,
-    ``weight`` and the numbers in those of `ShownTests`, NaN where there is none. ``all_weights_one`` says whether no
-    maneuver was drawn from an importance function: plain naturalistic driving.
+    ``count``, ``weight`` (5,) are episodes and sums of weights per outcome, in the order of `OUTCOMES`; ``causes``
+    count failed episodes by kind of cause. A weight is what a test adds to the estimate: its likelihood ratio or, of
+    tests from shells, p_s/n_s; failed tests have none. ``rows`` (m,) are ``outcome``, ``weight`` and the numbers of
+    `ShownTests`, NaN where there is none. With ``all_weights_one`` no maneuver was drawn from an importance function.
     """
 
     count: FloatArray

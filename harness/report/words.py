@@ -1,7 +1,6 @@
 """The answer at a glance, in words, from the numbers of ``estimates.json``: for terminal, page and JUnit.
 
-Here stand whose answer it is, what to be warned of, and how far it goes, and all of it laid out for a terminal; its
-rows are in `harness.report.rows`.
+Here are its vehicle, warnings and scope, and its layout for a terminal; its rows are in `harness.report.rows`.
 """
 
 from __future__ import annotations
@@ -142,10 +141,10 @@ def _missed(manifest: Mapping[str, Any], estimates: Estimates, times: float) -> 
 
 
 def warnings_of(scenario: str, result: Mapping[str, Any], unit: str, but: str = "") -> Iterator[str]:
-    """What changes the meaning of a rate, a line each.
+    """What changes the meaning of a rate, a line each; rates are in a ``unit``.
 
-    ``result`` holds the rate, its upper limit ``ci_high``, the numbers of tests, and `doubts_of`. Rates are in a
-    ``unit``. ``but`` is added where tests ended too early to tell whether they were safe.
+    ``result`` holds the rate, ``ci_high``, numbers of tests, and `doubts_of`; ``but`` is added to the line on tests cut
+    off.
     """
     milder = result["milder"]
     if milder is not None and (n_bad := milder["n_crashes"] + milder["n_failed"]):
@@ -322,10 +321,9 @@ MOST_WARNINGS = 3
 
 
 def lines(answer: ShortAnswer, took_s: float | None = None, report: Path | None = None) -> list[str]:
-    """An answer for a terminal: at most `LINES` lines.
+    """An answer for a terminal: at most `LINES` lines; those of more than `WIDTH` columns go on below.
 
-    Those of more than `WIDTH` columns go on below. Where there is much to warn of the last rows give way: all of it is
-    on the page.
+    Where there is much to warn of, the last rows give way: all of it is on the page.
     """
     warnings = few([f"! {text}" for text in answer.warnings], MOST_WARNINGS)
     ends = [answer.scope, *([] if report is None else [f"report  {report}"])]

@@ -23,7 +23,7 @@ from harness.estimators.answer import ended_by
 from harness.estimators.estimate import finite_json
 from harness.estimators.likelihood import Level
 from harness.estimators.pairs import PairDecision, Pairs, contrast, paired_estimate
-from harness.estimators.per_hour import OfFamily, PerHour
+from harness.estimators.per_hour import FamilyTests, PerHour
 from harness.estimators.stopping import PairRule
 from harness.families import family_named
 from harness.numbers import leaves, two_digits_up
@@ -230,7 +230,7 @@ def _sum_written(
         ready = {scenario.name: scenario.runs[i].run.resolved for scenario in scenarios}
         shown = {scenario.name: scenario.results[i].shown for scenario in scenarios}
         answers = {name: (run.estimates, run.manifest) for name, run in shown.items()}
-        families = [OfFamily(each.name, each.exposure, each.tests_of_pairs(i)) for each in scenarios]
+        families = [FamilyTests(each.name, each.exposure, each.tests_of_pairs(i)) for each in scenarios]
         sides[side] = hour_answer(PerHour(families), ready, answers, confidence)
     contrasts = {scenario.name: contrast(together([scenario], campaign), level) for scenario in scenarios}
     content = finite_json({

@@ -23,7 +23,7 @@ from harness.campaign.files import campaign_of, dump_campaign, load_campaign
 from harness.errors import CampaignError, RunFolderError, told_of
 from harness.estimators.answer import Estimates, ended_by
 from harness.estimators.estimate import finite_json
-from harness.estimators.per_hour import OfFamily, PerHour, own_exposure
+from harness.estimators.per_hour import FamilyTests, PerHour, own_exposure
 from harness.estimators.shells import SeenShells
 from harness.estimators.stopping import Decision, RoundRule
 from harness.families.protocol import Exposure
@@ -158,7 +158,7 @@ def _run(
         runs = dict(zip(campaign.scenarios or [], each_run, strict=True))
         seen = {name: SeenShells(underway.prescribed.design) for name, underway in runs.items()}
         exposures = {name: exposure_of(underway.run.resolved, campaign.exposure) for name, underway in runs.items()}
-        hour = PerHour([OfFamily(name, exposures[name], tests) for name, tests in seen.items()])
+        hour = PerHour([FamilyTests(name, exposures[name], tests) for name, tests in seen.items()])
         rounds = HourRounds(campaign, hour, [underway.prescribed.available for underway in runs.values()], rule)
         n_held = sum(underway.run.earlier.n_episodes for underway in runs.values())
         progress.stage("tests of all scenarios", None, done=n_held)

@@ -23,7 +23,7 @@ from harness.estimators.answer import Estimates, estimate_blocks
 from harness.estimators.block import BASELINE_COLUMNS, MOMENT_COLUMNS, Block, block_from_tables
 from harness.estimators.estimate import finite_json
 from harness.estimators.one_pass import asked_for, even
-from harness.estimators.per_hour import OfFamily, PerHour
+from harness.estimators.per_hour import FamilyTests, PerHour
 from harness.estimators.shells import SeenShells
 from harness.families import family_named
 from harness.families.protocol import Environment
@@ -339,7 +339,7 @@ def estimate_families(
         manifest, tests = read_manifest(run), SeenShells.of_blocks(stored_blocks(run, moments=False))
         resolved = ready[name] = resolve(read_campaign(run, manifest))
         require_campaign(run / CAMPAIGN, resolved.content_hash, manifest)  # exposures are those of its file
-        families.append(OfFamily(name, exposure_of(resolved, exposures), tests))
+        families.append(FamilyTests(name, exposure_of(resolved, exposures), tests))
         answers[name] = read_as(Estimates, run / ESTIMATES, mend=MEND), manifest
     answer = hour_answer(PerHour(families), ready, answers, confidence or stored["confidence"], counts=counts)
     ran = stored.pop("ran", None) or {name: stored[name] for name in ("exposure", "decision")}

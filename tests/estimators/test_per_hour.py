@@ -10,7 +10,7 @@ import pytest
 
 from harness.campaign.files import load_campaign
 from harness.estimators.likelihood import Level, likelihood_limit
-from harness.estimators.per_hour import OfFamily, PerHour
+from harness.estimators.per_hour import FamilyTests, PerHour
 from harness.estimators.shells import SeenShells
 from harness.estimators.stopping import Decision, RoundRule
 from harness.estimators.tally import Tally
@@ -34,7 +34,7 @@ def family(name, p, tests, crashes, exposure, reference=(), p_event=1.0):
     )  # fmt: skip
     counts = [np.array(each, np.int64) for each in (tests, crashes, np.zeros(n))]
     mass = np.diag(counts[1] * p)  # every path has the same probabilities
-    return OfFamily(name, exposure, SeenShells.of(design, Tally(*counts, mass, np.zeros((n, n)))))
+    return FamilyTests(name, exposure, SeenShells.of(design, Tally(*counts, mass, np.zeros((n, n)))))
 
 
 CC = (Reference("r157-cc", "a driver"),)

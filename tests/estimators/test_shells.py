@@ -12,7 +12,7 @@ from harness.estimators.block import SamplingPlan
 from harness.estimators.estimate import Estimate, finite_json
 from harness.estimators.likelihood import Level, likelihood_limit
 from harness.estimators.one_pass import one_pass
-from harness.estimators.per_hour import OfFamily, PerHour
+from harness.estimators.per_hour import FamilyTests, PerHour
 from harness.estimators.shells import SeenShells
 from harness.estimators.tally import (
     FEWEST_PATHS,
@@ -297,7 +297,7 @@ def test_a_run_ends_on_the_interval_that_is_written_also_where_failed_tests_lie_
     seen, written = SeenShells.of_blocks([block]), one_pass([block], ("shells",)).headline_estimate
     assert seen.limits(LEVEL)[1:3] == (written.ci_low, written.ci_high)
     assert seen.limits(LEVEL).rhw == written.rhw
-    hour = PerHour([OfFamily("cut_in", Exposure(1.0, 1.0, 1.0, None, ""), seen)])
+    hour = PerHour([FamilyTests("cut_in", Exposure(1.0, 1.0, 1.0, None, ""), seen)])
     highs = written.ci_high == 1.0, seen.beside("r157-cc", ASSUMPTION_FREE, LEVEL)[1] == math.inf
     assert (*highs, hour.limits(LEVEL).high == math.inf) == (on == 1,) * 3
 

@@ -20,7 +20,7 @@ from harness.estimators.limits import garwood
 from harness.families.following.family import FollowingFamily
 from harness.families.words import EXCLUDED
 from harness.fitting.files import OF_YAML, environment_text
-from harness.fitting.protocol import Asked, Fitted
+from harness.fitting.protocol import FitRequest, Fitted
 from harness.fitting.recording import Recording
 from harness.fitting.tracks import R1_MAX_M, V_MAX_MPS, V_MIN_MPS, Scene
 from harness.numbers import number
@@ -97,7 +97,7 @@ class FollowingFitter:
     def observe(self, recording: Recording) -> None:
         self._seen.append(self.seen(recording))
 
-    def fitted(self, asked: Asked, others: Mapping[str, Fitted]) -> Fitted:
+    def fitted(self, asked: FitRequest, others: Mapping[str, Fitted]) -> Fitted:
         base = self.family.default_parameters
         hours = math.fsum(each.hours for each in self._seen)
         events = np.concatenate([each.events for each in self._seen])

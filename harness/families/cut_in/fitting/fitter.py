@@ -30,7 +30,7 @@ from harness.families.cut_in.parameters import SHIPPED_FOLDER, EnvironmentParame
 from harness.families.cut_in.sections import HAZARD_OF, REPLACED
 from harness.files import content_hash
 from harness.fitting.files import OF_YAML, environment_text
-from harness.fitting.protocol import Asked, Fitted
+from harness.fitting.protocol import FitRequest, Fitted
 from harness.fitting.recording import Recording
 from harness.fitting.table import places
 from harness.progress import Progress
@@ -179,7 +179,7 @@ class CutInFitter:
     def observe(self, recording: Recording) -> None:
         self._seen.append(observe(recording))
 
-    def fitted(self, asked: Asked, others: Mapping[str, Fitted]) -> Fitted:
+    def fitted(self, asked: FitRequest, others: Mapping[str, Fitted]) -> Fitted:
         where = places(asked.files)
         tally = require_enough(self._seen, where, asked.read)
         fit = fit_traffic(ObservedTraffic.of(self._seen), where, asked.progress)
@@ -195,7 +195,7 @@ class CutInFitter:
         return Fitted(files, _told(fit, tally, asked, noise_mps2), _facts(fit, tally))
 
 
-def _text(fit: Fit, tally: BesideCounts, asked: Asked) -> str:
+def _text(fit: Fit, tally: BesideCounts, asked: FitRequest) -> str:
     clusters = "recording" if fit.traffic.by_recording else "vehicle, as recordings are few"
     head = [
         f"{fit.traffic.n_recordings} recordings: "
@@ -207,7 +207,7 @@ def _text(fit: Fit, tally: BesideCounts, asked: Asked) -> str:
     return environment_text(head, fit.environment.model_dump(exclude_defaults=True))
 
 
-def _told(fit: Fit, tally: BesideCounts, asked: Asked, noise_mps2: float) -> tuple[str, ...]:
+def _told(fit: Fit, tally: BesideCounts, asked: FitRequest, noise_mps2: float) -> tuple[str, ...]:
     traffic, steps, unseen = fit.traffic, fit.acceptance, fit.environment.unseen
     side = "left" if asked.read.mirror else "right"
     noisy = f"! noise of {noise_mps2:.2g} m/s² in accelerations: the scatter of the fitted ones is off by as much"

@@ -22,7 +22,7 @@ from harness.families.cut_in.loading import evaluate_laws, load_environment
 from harness.families.cut_in.parameters import SHIPPED_FOLDER, EnvironmentParameters
 from harness.families.cut_in.sections import HAZARD_OF
 from harness.families.cut_in.vocabulary import ACCELERATIONS_MPS2, N_ACCELERATIONS
-from harness.fitting.protocol import Asked
+from harness.fitting.protocol import FitRequest
 from harness.numbers import number
 from harness.report.drawing import Plot, PlotAxis, PlotPanel
 from harness.report.templates import templates
@@ -52,7 +52,7 @@ class Fit:
     environment: EnvironmentParameters
 
 
-def page(fit: Fit, tally: BesideCounts, noise_mps2: float, asked: Asked, others: Sequence[str]) -> str:
+def page(fit: Fit, tally: BesideCounts, noise_mps2: float, asked: FitRequest, others: Sequence[str]) -> str:
     """The page; ``noise_mps2`` is the sd of accelerations by measurement, ``others`` is what other families found."""
     template = templates(__package__).get_template("fit.html.j2")
     shown = template.render(
