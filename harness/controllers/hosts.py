@@ -190,7 +190,7 @@ class Guard:
         Guard._current = None
 
     def acceleration(self, answer: Any) -> tuple[float, str | None]:
-        """An answer as a number, also if an array of one, and what is wrong with it: subclasses compare as they like."""
+        """An answer, or an array of one, as a number, and what is wrong with it: a subclass may compare as it likes."""
         if not isinstance(answer, float) and hasattr(answer, "__array__") and not np.ma.is_masked(answer):
             array = np.asarray(answer)
             answer = array.item() if array.size == 1 and array.dtype.kind in "iufO" else answer
