@@ -30,16 +30,7 @@ from harness.families.numbers import ParameterFile
 from harness.families.protocol import Environment, Family
 from harness.files import content_hash
 from harness.processes import made_ahead
-from harness.records.folder import (
-    CAMPAIGN,
-    Part,
-    concatenated,
-    no_episodes,
-    read_kept,
-    read_manifest,
-    read_table,
-    require_sum,
-)
+from harness.records import folder as records
 from harness.records.schemas import LEAD, path_columns
 from harness.resolved import resolve
 from harness.vocabulary import FAMILIES
@@ -55,8 +46,8 @@ def read_campaign(folder: Path, manifest: Mapping[str, Any], *, check_files: boo
 
     Raises `RunFolderError`: ``campaign.yaml`` is missing or damaged, or is another campaign than the manifest's.
     """
-    path = folder / CAMPAIGN
-    mend = f"Restore {CAMPAIGN} as the run has written it, and files that it names, or run the campaign again."
+    path = folder / records.CAMPAIGN
+    mend = f"Restore {records.CAMPAIGN} as the run has written it, and files that it names, or run the campaign again."
     try:
         campaign = load_campaign(path, check_files=check_files)
     except CampaignError as error:
@@ -64,7 +55,7 @@ def read_campaign(folder: Path, manifest: Mapping[str, Any], *, check_files: boo
         expected = "a campaign with all its sections, as the run has written it"
         raise RunFolderError(str(path), found, expected, mend) from error
     crc32 = manifest.get("campaign_crc32")
-    require_sum(path, crc32, path.read_bytes(), mend)
+    records.require_sum(path, crc32, path.read_bytes(), mend)
     if crc32 is None:  # its run was killed as it began
         with suppress(CampaignError):  # its environment file is gone: it cannot be checked
             require_campaign(path, resolve(campaign).content_hash, manifest)
@@ -87,14 +78,14 @@ def traffic_of(campaign: Campaign, manifest: Mapping[str, Any]) -> Environment |
     return None
 
 
-def read_traces(folder: Path, parts: Sequence[Part], episodes: Collection[int]) -> pa.Table | None:
+def read_traces(folder: Path, parts: Sequence[records.Part], episodes: Collection[int]) -> pa.Table | None:
     """Trace rows of a few episodes; None where none of them was traced."""
     traces = []
     for part in parts:
         if "traces" in part.files and any(part.first_episode <= episode < part.end for episode in episodes):
-            table = read_kept(folder, part, "traces")
+            table = records.read_kept(folder, part, "traces")
             traces.append(table.filter(pc.is_in(table["episode"], pa.array(sorted(episodes)))))
-    return concatenated(traces, folder) if any(table.num_rows for table in traces) else None
+    return records.concatenated(traces, folder) if any(table.num_rows for table in traces) else None
 
 
 def read_replicates(name: str, parameters: ParameterFile, shipped: Path) -> list[dict[str, float]]:
@@ -103,7 +94,7 @@ def read_replicates(name: str, parameters: ParameterFile, shipped: Path) -> list
     if replicates is None:
         return []
     path, mend = file.parent / replicates.file, "Write it anew with `harness fit`, or leave out the key replicates."
-    table = read_table(path, mend=mend)
+    table = records.read_table(path, mend=mend)
     numbers_hash = (table.schema.metadata or {}).get(OF_REPLICATES)
     expected = f"the replicates that {file.name} was written with"
     if content_hash(path.read_bytes()) != replicates.sha256:
@@ -131,7 +122,7 @@ def code_of(av: AutomatedVehicle) -> str | None:
 
 def require_trust(folder: Path, manifest: Mapping[str, Any], code: str | None, mend: str) -> None:
     """Refuse (`RunFolderError`) to run ``code`` named by a folder that this user has not made on this machine."""
-    signed = signature((folder / CAMPAIGN).read_bytes())
+    signed = signature((folder / records.CAMPAIGN).read_bytes())
     if code is not None and (signed is None or not hmac.compare_digest(signed, str(manifest.get("signature")))):
         found = f"a run that was not made on this machine by this user; it names {code}, which would be run"
         raise RunFolderError(str(folder), found, "a run of your own, or your word for that code", mend)
@@ -198,8 +189,8 @@ class ShownTests:
         rows, motion = _columns(family, shows=manifest["events_show"])
         columns = sorted({"failure", *rows, *motion})
 
-        def shown(part: Part) -> ShownTests:
-            episodes = read_kept(folder, part, "episodes", columns)
+        def shown(part: records.Part) -> ShownTests:
+            episodes = records.read_kept(folder, part, "episodes", columns)
             return cls.of(episodes.slice(0, max(manifest["n_episodes"] - part.first_episode, 0)), family)
 
         return cls.joined(list(made_ahead(shown, manifest["parts"], N_READERS)), folder)
@@ -208,12 +199,12 @@ class ShownTests:
     def joined(cls, parts: Sequence[ShownTests], folder: Path) -> ShownTests:
         """Consecutive parts of a run as one; a `RunFolderError` without any."""
         if not parts:
-            raise no_episodes(folder)
+            raise records.no_episodes(folder)
         return cls(
             sum((part.outcomes for part in parts), Counter[str]()),
             sum((part.causes for part in parts), Counter[str]()),
-            concatenated([part.rows for part in parts], folder),
-            concatenated([part.crashes for part in parts], folder),
+            records.concatenated([part.rows for part in parts], folder),
+            records.concatenated([part.crashes for part in parts], folder),
         )
 
 
@@ -231,10 +222,11 @@ def hardest_crash(folder: Path) -> tuple[Path, int]:
     several, crashes = (folder / FAMILIES).is_file(), list[tuple[float, int, Path]]()
     runs = [manifest.parent for manifest in sorted(folder.glob("*/manifest.json"))] if several else [folder]
     for run in runs:
-        if not (parts := read_manifest(run)["parts"]):
-            raise no_episodes(run)
+        if not (parts := records.read_manifest(run)["parts"]):
+            raise records.no_episodes(run)
         for part in parts:
-            columns = read_kept(run, part, "episodes", ["impact_speed_mps", "episode"]).drop_null()  # null: no crash
+            # Tests without a crash have no impact speed.
+            columns = records.read_kept(run, part, "episodes", ["impact_speed_mps", "episode"]).drop_null()
             speeds_mps, episodes = (column.to_pylist() for column in columns.itercolumns())
             crashes += [(-speed_mps, episode, run) for speed_mps, episode in zip(speeds_mps, episodes, strict=True)]
     if not crashes:

@@ -39,7 +39,7 @@ SMALLEST_FAILED_SAMPLE = 200
 """Tests before the share of failures can end a run; a tenth of that where most fail."""
 SHARE = "run.max_failed_share"
 _PACKAGES = ("harness", "libsumo", "numba", "llvmlite", "numpy", "scipy", "pyarrow")
-_INTERVAL_S, _SHARE = 5.0, 0.05
+_INTERVAL_S, _WRITING_SHARE = 5.0, 0.05
 """Time between two writes, and the share of the time that they may take."""
 PART_TESTS, PART_ROWS = 50_000, 2_000_000
 """Tests, or rows of all tables together, at which a part is full: it is kept in memory until then."""
@@ -151,7 +151,7 @@ class Run:
     def written_if_due(self) -> Run:
         """Write it where the last write is some seconds ago."""
         when, took = self.wrote
-        return self if time.monotonic() - when < max(_INTERVAL_S, took / _SHARE) else self.written()
+        return self if time.monotonic() - when < max(_INTERVAL_S, took / _WRITING_SHARE) else self.written()
 
     def written(self, status: str = "running", **of_the_end: Any) -> Run:
         """Write all tests that there are, then the manifest that lists them; the run that knows its files."""

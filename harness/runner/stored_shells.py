@@ -76,9 +76,8 @@ class StoredShells:
         manifest = read_manifest(folder)
         campaign = read_campaign(folder, manifest, check_files=True)
         if not campaign.sampling.strata or campaign.has_baseline_runs:
-            found = f"tests by {campaign.testing.method}"
-            if campaign.sampling.strata:
-                found = "a vehicle that acts before the event: its events follow from its own runs"
+            acts = "a vehicle that acts before the event: its events follow from its own runs"
+            found = acts if campaign.sampling.strata else f"tests by {campaign.testing.method}"
             expected = "tests of shells, of a vehicle that holds its speed until the event"
             raise CampaignError(option, found, expected, ELSEWHERE)
         here = resolve(campaign)
