@@ -63,7 +63,7 @@ class Comparison(ShownInPython):
     exit_code: int
     report: Path
     shown: list[RunFolder]
-    """What the page is made of, of A and of B."""
+    """Content of the page, of A and of B."""
 
     def _lines(self) -> list[str]:
         last = self.shown[1]

@@ -1,4 +1,4 @@
-"""What the process imports that workers are copies of: all that takes long. It has one thread, as copies need it."""
+"""Imports all that takes long in the process that workers are forked from, in one thread, as forking needs it."""
 
 import gc
 import os
@@ -6,12 +6,12 @@ import signal
 from contextlib import suppress
 from importlib import import_module
 
-before = signal.signal(signal.SIGINT, signal.SIG_IGN)  # of Ctrl-C the command itself tells, which has begun this
-signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})  # without it (`harness.processes`)
-os.environ.pop("PYTHONSAFEPATH", None)  # of this process alone, not of what vehicles start (`harness.processes`)
+before = signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is handled by the command, this one's parent
+signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})  # it began with it blocked (`harness.processes`)
+os.environ.pop("PYTHONSAFEPATH", None)  # set for its own imports: programs that vehicles start need it not
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 for name in ("harness.runner.workers", "pandas", "libsumo"):  # pandas is loaded by pyarrow
-    with suppress(Exception):  # who needs it will say so
+    with suppress(Exception):  # an error is raised where the module is needed
         import_module(name)
 signal.signal(signal.SIGINT, before)
-gc.freeze()  # what is never looked through is never copied
+gc.freeze()  # objects that are not traversed are not written to, and so stay shared with the copies

@@ -28,10 +28,10 @@ _OTHERS = [
 
 
 def compile_kernels(progress: Progress | None = None) -> bool:
-    """Compile what campaigns of all methods and scenarios need, on two cores; False where it was done.
+    """Compile what campaigns of all methods and scenarios need, on two cores; False if that was done before.
 
-    Once compiled, one half goes on with the pool that most first campaigns ask for, while the other half compiles. The
-    cache keeps all of it. Where it cannot be written this says nothing: the first run compiles them again.
+    One process builds the pool that most first campaigns need once it has compiled, while the other still compiles. All
+    is kept in the cache; where that cannot be written there is no error, and the first run compiles again.
     """
     done = f"{KERNELS}/all"
     if cache.has(done):
@@ -42,12 +42,12 @@ def compile_kernels(progress: Progress | None = None) -> bool:
         controller.write_text(_CONTROLLER)
         campaigns = [(f"{controller}:Holds", *_SMALL), ("idm", *_SHORT)]
         progress.stage("compiling, and building a pool of cut-ins", None)
-        beside = Child(tell, partial(_run_all, _OTHERS, Path(folder) / "others"))
+        child = Child(tell, partial(_run_all, _OTHERS, Path(folder) / "others"))
         try:
             _run_all(campaigns, Path(folder))
-            died = isinstance(first_to_answer([beside]).answer(), WorkerDeath)
+            died = isinstance(first_to_answer([child]).answer(), WorkerDeath)
         finally:
-            beside.kill()
+            child.kill()
     if not died:  # as for want of memory: the next call tries again
         cache.keep(done, b"")
     return True

@@ -49,7 +49,7 @@ _EXIT_OF: Mapping[Verdict | PairVerdict, int] = {
 
 
 def exit_code(decision: Decision | PairDecision | None, *, missed: bool) -> int:
-    """Of a command, by its decision; where none was asked for, by whether the asked precision was ``missed``."""
+    """Exit code by the decision; where none was asked for, by whether the asked precision was ``missed``."""
     return _EXIT_OF[decision.verdict] if decision else EXIT_BUDGET_SPENT if missed else EXIT_DONE
 
 
@@ -68,7 +68,7 @@ class RunResult(ShownInPython):
     stopped_by: StoppedBy
     exit_code: int
     shown: RunFolder
-    """What its page is made of."""
+    """Content of its page."""
 
     def _lines(self) -> list[str]:
         return run_lines(self.shown.campaign, self.shown.manifest, self.shown.estimates, self.report)
@@ -85,7 +85,7 @@ class Underway:
     crew: Workers
     progress: Progress
     name: str = ""
-    """Of the vehicle and scenario, in errors, where other runs go on beside it."""
+    """Vehicle and scenario, for errors, where other runs go on beside it."""
 
     @property
     def prescribed(self) -> PrescribedEpisodes:
@@ -262,7 +262,7 @@ def begun(places: Places, workers: int | None, progress: Progress) -> Iterator[l
 
 
 def workers_of(resolved: Resolved, n_workers: int | None, *, n_runs: int = 1) -> Workers:
-    """Where a campaign's shards are run, by turns if there are ``n_runs``; a `HarnessError` where there is no room."""
+    """Workers for a campaign's shards, by turns if there are ``n_runs``; a `HarnessError` where there is no room."""
     if resolved.campaign.run.executor == "local":
         return LocalWorkers(resolved, n_workers)
     try:
