@@ -128,7 +128,8 @@ def compare_campaigns(
       90 % intervals cover sampling error in this simulated traffic only; stopped: verdict reached
       report  runs/late/report.html
     """
-    a, b, out, stored = campaign_of(a), campaign_of(b), Path(out), None if stored is None else Path(stored)
+    a, b = campaign_of(a), campaign_of(b)
+    out, stored = Path(out), None if stored is None else Path(stored)
     folders = {name: name for name in a.scenarios} if a.scenarios else {a.scenario: ""}
     if stored is not None:
         _require_stored(stored, [*folders.values()], a, out)
