@@ -63,7 +63,7 @@ def test_run_prints_the_answer_and_where_more_is(folder, capsys):
     assert main(command) == 0
     out, content = capsys.readouterr().out.splitlines(), estimates(folder)
     short = run_lines(golden("shells-refuted"), manifest(folder), content, folder / "report.html")
-    assert (out, len(out)) == (short, 6)
+    assert (out, len(out)) == (short, 7)
     assert main([*command, "--json"]) == 0
     assert json.loads(capsys.readouterr().out) == content
 

@@ -81,15 +81,19 @@ def _exposures(ctx: click.Context, parameter: click.Parameter, texts: tuple[str,
     found = {}
     for text in texts:
         name, _, value = text.partition("=")
-        family_named(name, f"--exposure {text}")
-        found[name] = click.FloatRange(*EXPOSURES)(value, parameter, ctx)
+        family_named(name, where := f"--exposure {text}")
+        try:
+            found[name] = click.FloatRange(*EXPOSURES)(value, parameter, ctx)
+        except click.BadParameter as error:
+            expected = "events per hour of driving, {:g} to {:g}".format(*EXPOSURES)
+            raise HarnessError(where, error.message, expected, f"Write --exposure {name}=0.1, one each.") from None
     return found
 
 
 exposure_option = click.option(
     "--exposure", "exposures", metavar="SCENARIO=N", multiple=True, callback=_exposures,
-    help="Events per hour of driving, of one of several scenarios (of cut-outs those in scope, 0.4 % of all). May be "
-    "given several times.",
+    help="Events per hour of driving, of one scenario of several: cut-ins closing by 5 m/s or more, brakings of 3 m/s² "
+    "or more, cut-outs in scope (0.4 % of all). May be given several times.",
 )  # fmt: skip
 executor_option = click.option(
     "--executor", type=click.Choice(["local", "ray"]),

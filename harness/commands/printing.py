@@ -88,8 +88,8 @@ def error_in(junit: Path | None, suite: str) -> Iterator[None]:
 
 _AGAIN = "Nothing finished is lost: then give the same command again (`run` with --resume)."
 _HOW_TO_GO_ON = {
-    "run": " Finished tests are kept: the same command with --resume goes on.",
-    "compare": " Finished tests are kept: the same command goes on.",
+    "run": " Nothing finished is lost: the same command with --resume goes on.",
+    "compare": " Nothing finished is lost: the same command goes on.",
 }
 
 

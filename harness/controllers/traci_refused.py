@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 from typing import Any, ClassVar, NoReturn
 
 from harness.problems import did_you_mean
@@ -18,6 +19,8 @@ _REFUSED = {
 _NO_MODEL = "no model of SUMO's drives the AV: setSpeed, setAcceleration, slowDown do, bounded by setAccel and setDecel"
 _REFUSED_BEGINNINGS = ("set", "add", "remove", "move", "change", "reroute", "openGap", "replace", "insert", "resume")
 
+_MISSPELT = 0.9
+"""Similarity to what there is from which a name is a typing error: TraCI's own names differ by more."""
 _NOT_TRACIS = ("see", "leave", "end", "next_acceleration", "require_unfinished", "over", "n_steps", "step_s", "time_s")
 
 
@@ -47,10 +50,12 @@ class Domain:
     def __getattr__(self, name: str) -> Any:
         if name.startswith("_"):
             raise AttributeError(name)
-        why = _REFUSED.get(name, _NO_MODEL if name.startswith("set") else None)
-        why = why or (WOULD_MOVE if name.startswith(_REFUSED_BEGINNINGS) else None)
+        public = [entry for entry in dir(type(self)) if entry[0] != "_" and entry not in _NOT_TRACIS]
+        why = _REFUSED.get(name)
+        if why is None and not difflib.get_close_matches(name, public, 1, _MISSPELT):
+            moves = WOULD_MOVE if name.startswith(_REFUSED_BEGINNINGS) else None
+            why = _NO_MODEL if name.startswith("set") else moves
         if why is None:
-            public = [entry for entry in dir(type(self)) if entry[0] != "_" and entry not in _NOT_TRACIS]
             domains = [entry for entry in vars(self) if isinstance(getattr(self, entry), Domain) and entry[0] != "_"]
             there = f"; it has {', '.join(domains)}" if domains else ": delete the line, or put in a value of your own"
             there = "" if did_you_mean(name, domains or public) else there

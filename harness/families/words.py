@@ -16,16 +16,17 @@ EXCLUDED = "the fitted data exclude it"
 class Words(NamedTuple):
     """Nouns and phrases of pages and terminals.
 
-    ``called`` is the scenario; ``event``, ``events`` what happens in it, ``since`` the moment that times are counted
-    from. ``kicker`` says what pages are about, ``such`` what a rate per million km is of, ``same`` what two vehicles
-    meet alike, ``none`` that nothing happened, ``strikes`` what the AV does in a crash, ``who`` the vehicles are, and
-    ``unlikely`` why probabilities of events do not add up to 1. ``shows`` and ``happens`` are a vehicle each and what
-    it does at the onset and at the event; the same where they are one. ``tests`` says of which kind tests are, by
-    whether events show themselves, and ``rests`` what a rate scales with, by the traffic (None where it is not known)
-    and the level of lane changing.
+    ``called`` is the scenario, ``test`` what a rate per test is of; ``event``, ``events`` what happens in it, ``since``
+    the moment that times are counted from. ``kicker`` says what pages are about, ``such`` what a rate per million km is
+    of, ``same`` what two vehicles meet alike, ``none`` that nothing happened, ``strikes`` what the AV does in a crash,
+    ``who`` the vehicles are, and ``unlikely`` why probabilities of events do not add up to 1. ``shows`` and ``happens``
+    are a vehicle each and what it does at the onset and at the event; the same where they are one. ``tests`` says of
+    which kind tests are, by whether events show themselves, and ``rests`` what a rate scales with, by the traffic (None
+    where it is not known) and the level of lane changing.
     """
 
     called: str
+    test: str
     event: str
     events: str
     since: str
@@ -45,7 +46,8 @@ class Words(NamedTuple):
 def words_of(*, event: str, of: str, **own: Any) -> Words:
     """What can be said of an event ``of`` a vehicle that has a name, and whatever a family has of its ``own``."""
     said = {
-        "called": event, "events": f"{event}s", "since": f"the {event}", "such": "", "same": f"{event}s",
+        "called": event, "test": f"one {event}", "events": f"{event}s", "since": f"the {event}", "such": "",
+        "same": f"{event}s",
         "kicker": f"How often an automated vehicle (AV) crashes when there is a {event}, on a motorway",
         "none": f"There was no {event}.", "strikes": "", "who": f"{of} the one that the {event} is about",
         "shows": (of, f"begins the {event}"), "happens": (of, f"does the {event}"), "unlikely": "",

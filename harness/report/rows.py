@@ -12,6 +12,7 @@ from harness.estimators.answer import AssumedOfRate, Estimates, before_event, n_
 from harness.estimators.estimate import Estimate
 from harness.estimators.severity import HARD_MPS, TOUCH_MPS, Severity
 from harness.estimators.traffic import TrafficError, Uncertain
+from harness.families import family_named
 from harness.numbers import MISSING, count, interval, number, plain, ratio, share, tenths
 from harness.strata import ASSUMPTION_FREE, LIBRARY_STATEMENT
 
@@ -55,7 +56,8 @@ def rows_of(campaign: Campaign, manifest: Mapping[str, Any], estimates: Estimate
     so_far = " so far" if best.untested and best.n_crashes else ""
     above_mps = campaign.crash.counts_above_mps
     what = (f"crash rate > {plain(above_mps)} m/s" if above_mps else "crash rate") + so_far
-    rows = [_rate_row(what, estimates, unseen, from_below=from_below)]
+    such = family_named(campaign.scenario).words.such
+    rows = [_rate_row(what, such, estimates, unseen, from_below=from_below)]
     references = [each for each in best.details.get("references", ()) if each["crash_rate"] > 0.0][:1]
     how = {"wide": wide, "from_below": from_below}
     how["softened"] = n_softened(before_event(campaign, manifest, estimates.diagnostics)) > 0
@@ -75,8 +77,8 @@ def rows_of(campaign: Campaign, manifest: Mapping[str, Any], estimates: Estimate
         yield within(best.details["within"])
 
 
-def _rate_row(what: str, estimates: Estimates, unseen: AssumedOfRate | None, *, from_below: bool) -> Row:
-    """The rate with its interval, or with one limit alone where the other end says nothing."""
+def _rate_row(what: str, of_km: str, estimates: Estimates, unseen: AssumedOfRate | None, *, from_below: bool) -> Row:
+    """The rate with its interval, or with one limit alone where the other end says nothing; ``of_km`` driven how."""
     best, distance_km = estimates.best, estimates.distance_per_test_km
     sign, shown, ends = "", best.crash_rate, interval(best.ci_low, best.ci_high, beside=best.crash_rate)
     sampled = f"estimate {number(best.crash_rate)}" if best.n_crashes else "no crash seen"
@@ -87,7 +89,7 @@ def _rate_row(what: str, estimates: Estimates, unseen: AssumedOfRate | None, *, 
         sign, shown, ends = "> ", best.ci_low, sampled
     elif not best.n_crashes or best.is_wide:
         sign, shown, ends = "< ", best.upper_limit, sampled
-    remark = "" if not distance_km else f"{sign}{number(shown * 1e6 / distance_km)} per million km"
+    remark = "" if not distance_km else f"{sign}{number(shown * 1e6 / distance_km)} per million km{of_km}"
     if unseen is not None:
         remark = f"none seen at {unseen.where}"
     return Row("rate", what, f"{sign}{number(shown)} per test", ends, remark)

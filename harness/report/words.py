@@ -269,7 +269,8 @@ def _scope(campaign: Campaign, manifest: Mapping[str, Any], estimates: Estimates
         ended = "all tests done" if decision is None else ended + go_on(best.n_episodes, best.n_crashes, decision)
     elif stopped_by in ("rhw", "below_reference") and campaign.testing.shells.statement != ASSUMPTION_FREE:
         ended += f", given the {campaign.testing.shells.statement}"
-    return scope_words(best.confidence, ended)
+    test = family_named(campaign.scenario).words.test
+    return f"a test is {test}; {scope_words(best.confidence, ended)}"
 
 
 def go_on(n: int, n_crashes: int = 0, decision: Mapping[str, Any] | None = None) -> str:

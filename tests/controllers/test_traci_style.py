@@ -163,6 +163,11 @@ def test_what_is_not_the_avs_or_not_possible_is_refused(traci, reason, name, arg
     assert traci.vehicle.next_acceleration() == 0.0
 
 
+def test_a_misspelt_command_is_not_taken_for_one_of_tracis_that_is_refused(traci):
+    with pytest.raises(AttributeError, match="has no setAccelration here"):
+        traci.vehicle.setAccelration("AV", 1.0, 1.0)
+
+
 def start(episode=0):
     return EpisodeStart(episode, 0.1, np.random.default_rng(episode))
 

@@ -48,7 +48,8 @@ def test_it_is_short_and_says_what_changes_the_meaning(name, stored_run):
     assert "…" not in "".join(text[1:])
     assert " · 3.2 s" in text[0]
     assert text[-1] == f"  report  {run.path}/report.html"
-    assert "\n  90 % intervals cover sampling error in this simulated traffic only; stopped: " in "\n".join(text)
+    scope = "; 90 % intervals cover sampling error in this simulated traffic only; stopped: "
+    assert scope in re.sub(r"\n    ", " ", "\n".join(text))
     assert [each for each in SAID[name] if each not in re.sub(r"\n    ", " ", "\n".join(text))] == []
 
 
@@ -121,7 +122,7 @@ def test_a_rate_that_counts_no_crash_where_nothing_was_tested_says_so(name, unte
     shells = content["estimates"]["shells"]["details"]["shells"]
     assert any(not each["n_episodes"] for each in shells) == untested
     assert (rate["what"] == "crash rate so far") == untested
-    assert rate["remark"].endswith(" per million km")
+    assert rate["remark"].endswith(" per million km overtaking")
     assert not rows["ratio"]["value"].startswith("≥")
     assert (rows["impact"]["what"] == "impact speed so far") == untested
 

@@ -25,13 +25,14 @@ def _rests(traffic: Environment | None, level: str) -> str:
 
 WORDS = Words(
     called="cut-in",
+    test="one everyday overtaking, mostly without a cut-in",
     event="cut-in",
     events="cut-ins",
     since="BV entered the lane",
     kicker="How often an automated vehicle (AV) collides with a car that cuts in (BV, the background vehicle) behind a "
     "leading one (LV), on a motorway",
     same="cars that cut in",
-    such=" of such overtaking",
+    such=" overtaking",
     none="Nobody cut in.",
     strikes="In every crash the AV strikes BV from behind.",
     who="BV the one that cuts in, LV the one ahead of it",

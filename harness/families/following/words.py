@@ -25,9 +25,10 @@ STAND_INS = MappingProxyType(
 def words_of_following(*, event: str, then: str, depend: str, strikes: str, **own: Any) -> Words:
     """What pages say of events: what the one ahead does ``then``, and on what assumed numbers rates ``depend``."""
     return Words(
+        test=f"one {event} as in this traffic",
         event=event,
         events=f"{event}s",
-        such=" of such following",
+        such=" following",
         strikes=f"In every crash the AV strikes {strikes} from behind.",
         tests=lambda _: (
             "the vehicle follows another one on a straight road, at the distance that it chooses; then the one ahead "
