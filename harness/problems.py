@@ -70,6 +70,7 @@ def _parts(details: ErrorDetails, section: type[BaseModel]) -> dict[str, str]:
         expected, mend = f"one of the keys {', '.join(known)}", did_you_mean(last, known)
     elif kind == "model_type":
         expected = f"a section with keys such as {', '.join(list(section.model_fields)[:4])}"
+        mend = f"Write {example} there." if (example := getattr(section, "example", "")) else mend
         if "value" in section.model_fields and isinstance(value, int | float):
             mend = f"Write {{value: {value}, source: user}}."
     elif last == "[key]" and kind != "literal_error":

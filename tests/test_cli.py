@@ -103,6 +103,7 @@ def test_wrong_calls_end_with_2(capsys, arguments):
     [
         ("run --episodes 100", "Write --set stop.episodes=…"),
         ("run --seed 2", "Write --set seed=…"),
+        ("run --output x", "Did you mean '--out'?"),
         ("compare", "Write harness compare idm OTHER_AV, or say with --against"),
     ],
 )

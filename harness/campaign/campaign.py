@@ -66,7 +66,7 @@ class Campaign(Section):
     scenario: str = DEFAULT_FAMILY
     """kind of events that are tested: cut_in, lead_brakes, cut_out, or one that a package brings; several: scenarios"""
     scenarios: Annotated[list[str], Field(min_length=1)] | None = None
-    """several kinds of events in one answer per hour, in place of scenario"""
+    """several kinds of events in one answer per hour, in place of scenario: [cut_in, lead_brakes, cut_out]"""
     exposure: dict[str, EventsPerHour] = Field(
         default_factory=dict, description="events per hour of driving, by scenario"
     )

@@ -190,7 +190,10 @@ def named_vehicle(text: str, option: str = "") -> dict[str, Any]:
     if text.endswith(".py") and not Path(text).exists():
         found, files = "no such file", [str(file) for file in Path().glob("*.py")]
     expected = f"{'' if colon else _OTHER_FORMS}one of {', '.join(names[:FEW_NAMES])}, …"
-    mend = in_python_file(text) or did_you_mean(name, [*files, *names]) or f"Name one of them: {listed(names)}."
+    module, _, member = text.rpartition(".")
+    member_of = f"Write {module}.py:{member}." if member != "py" and Path(f"{module}.py").is_file() else ""
+    near = in_python_file(text) or did_you_mean(name, [*files, *names])
+    mend = member_of or near or f"Name one of them: {listed(names)}."
     raise CampaignError(f"{option}{text}", found, expected, mend)
 
 

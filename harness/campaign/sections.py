@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterator, Sequence
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, ClassVar, Literal, Self
 
 from pydantic import (
     AfterValidator,
@@ -257,6 +257,7 @@ class TimesReference(Section):
 class Accept(Section):
     """A limit: a run of shells ends when it is known on which side of it the rate of testing.shells.statement lies."""
 
+    example: ClassVar[str] = "{times_reference: {driver: r157-cc}}"
     crash_rate_below: float | None = Field(None, gt=0.0, lt=1.0)
     """crashes per test: accepted below it, rejected above"""
     times_reference: TimesReference | None = Field(None, description="the same beside a reference driver")

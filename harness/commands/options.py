@@ -154,10 +154,8 @@ def accepting(limit: str) -> list[str]:
         times, star, driver = limit.rpartition("*")
         if not star:  # 0.5r157-cc can mean nothing else
             times, driver = re.findall(r"^([\d.]*)(.*)$", limit)[0]
-        keys, value = (
-            ("times_reference", "crash_rate_below"),
-            f"{{driver: {json.dumps(driver)}, at_most: {times or 1}}}",
-        )
+        keys = ("times_reference", "crash_rate_below")
+        value = f"{{driver: {json.dumps(driver.strip())}, at_most: {times.strip() or 1}}}"
     return [f"accept.{keys[0]}={value}", f"accept.{keys[1]}=null"]
 
 

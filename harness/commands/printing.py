@@ -141,8 +141,14 @@ def usage_error(error: click.UsageError, context: click.Context) -> HarnessError
     """Put what click says of a wrong call into the words of all errors."""
     usage = " ".join(context.get_usage().removeprefix("Usage: ").split())
     mend, found = f"See `{context.command_path} --help`.", error.format_message().rstrip(".")
-    if isinstance(error, click.NoSuchOption) and (setting := _setting_of(error.option_name, context.command)):
-        found, mend = f"No such option '{error.option_name}'", f"Write --set {setting}=…"
+    if isinstance(error, click.NoSuchOption):
+        found = f"No such option '{error.option_name}'"
+        options = [option for each in context.command.params for option in each.opts if len(option) > 2]
+        longer = [option for option in options if error.option_name.startswith(option)]  # --output
+        if not longer and (setting := _setting_of(error.option_name, context.command)):
+            mend = f"Write --set {setting}=…"
+        elif meant := [*longer, *(error.possibilities or ())]:
+            mend = f"Did you mean '{meant[0]}'?"
     return HarnessError(context.command_path, found, f"a call of the form: {usage}", mend)
 
 

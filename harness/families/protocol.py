@@ -125,6 +125,10 @@ class Chosen(NamedTuple):
     lead: IntArray
 
 
+FAR_ABOVE = 10.0
+"""Times the highest shipped exposure: one beyond that is likely to count other events [assumed]."""
+
+
 class Exposure(NamedTuple):
     """How many events there are in an hour of driving, between ``low`` and ``high``.
 

@@ -198,7 +198,7 @@ def _source(shown: ShownShells) -> str:
     if shown.rate == 0.0:
         return "No shell contributes: no crash was sampled."
     most = max(shown.shells, key=lambda shell: shell.contribution)
-    return f"Most of the rate comes from {most.shell} ({share(most.contribution / shown.rate)})."
+    return f"The largest part of the rate comes from {most.shell} ({share(most.contribution / shown.rate)})."
 
 
 def _open_question(shown: ShownShells, names: tuple[str, ...], half_widths: list[float]) -> str:

@@ -26,7 +26,7 @@ from harness.estimators.estimate import finite_json
 from harness.estimators.per_hour import FamilyTests, PerHour, own_exposure
 from harness.estimators.shells import SeenShells
 from harness.estimators.stopping import Decision, RoundRule
-from harness.families.protocol import Exposure
+from harness.families.protocol import FAR_ABOVE, Exposure
 from harness.printed import PRINTED
 from harness.problems import listed
 from harness.progress import Progress
@@ -40,9 +40,6 @@ from harness.sampling.shells import HourRounds
 from harness.shown import ShownInPython
 from harness.strata import Assumed
 from harness.vocabulary import FAMILIES
-
-FAR_ABOVE = 10.0
-"""Times the highest shipped exposure: one given beyond that is likely to count other events [assumed]."""
 
 
 @checked("harness.run")

@@ -37,7 +37,7 @@ MISTAKES = (
     ("epsilon: 0.2", "epsilon", 2, "belongs under testing"),
     ("testing: 5", "testing", 2, "a section with keys such as method"),
     ("stop: 100", "stop", 2, "a section with keys such as episodes"),
-    ("accept: r157-cc", "accept", 2, "a section with keys such as crash_rate_below"),
+    ("accept: r157-cc", "accept", 2, "crash_rate_below, times_reference. Write {times_reference: {driver: r157-cc}}"),
     ("scenarios: all", "scenarios", 2, "a list"),
     ("exposure: 3", "exposure", 2, "names, each with its value"),
     ("av: my_av.py:MyAV", "av", 2, "a section with keys such as model, controller"),
@@ -259,6 +259,7 @@ def test_a_vehicle_is_a_campaign_by_the_recommended_method(vehicle, name, av, ow
     ("given", "said"),
     [
         ("my_av.py", "Name its class or function: my_av.py:MyAV or my_av.py:step"),
+        ("my_av.MyAV", "Write my_av.py:MyAV."),
         ("my_aw.py:MyAV", r"^av\.controller \(my_aw.py:MyAV\): found no file \S*my_aw.py;.* Did you mean 'my_av.py'"),
         ("mime.yaml", "no such file.* Did you mean 'mine.yaml'"),
         ("late-60ms", "or one of idm, [^;]{9,99}, ….* Did you mean 'late-600ms'"),

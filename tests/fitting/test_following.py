@@ -220,6 +220,14 @@ def test_that_data_exclude_an_exposure_that_is_kept_stands_in_the_file(hours, ex
     assert "in scope" not in found.told[0]  # all are
 
 
+@pytest.mark.parametrize(("hours", "far"), [(0.1, True), (2.0, False)])
+def test_a_rate_far_above_the_shipped_range_is_remarked(hours, far):
+    fitter = BrakingFitter()
+    fitter._seen = [Seen(hours, np.zeros(6, EVENT))]  # below what a law takes
+    found = fitter.fitted(SimpleNamespace(out=Path("mine.yaml"), provenance=list), {})
+    assert (" times the shipped one" in found.told[0]) == far
+
+
 def test_of_cut_outs_those_in_scope_are_told_as_a_campaign_counts_them(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     fitter, family = CutOutFitter(), family_named("cut_out")

@@ -18,6 +18,7 @@ import numpy as np
 from harness.campaign.sections import EnvironmentSettings
 from harness.estimators.limits import garwood
 from harness.families.following.family import FollowingFamily
+from harness.families.protocol import FAR_ABOVE
 from harness.families.words import EXCLUDED
 from harness.fitting.files import OF_YAML, environment_text
 from harness.fitting.protocol import FitRequest, Fitted
@@ -130,7 +131,9 @@ class FollowingFitter:
             note = f"{n} in {hours:.4g} h of following{part}"
             rate = {**fitted_number(n / of_all, math.sqrt(n) / of_all), "range": [low, high], "note": note}
             counted = {"exposure": {"per_hour": rate, "events": n, "hours": round(of_all, 6)}}
-            return counted, f"{told}{part}: {number(n / of_all)} per hour ({limits})"
+            far = low > FAR_ABOVE * (kept.range or [kept.value])[-1]
+            beside = f", {number(n / of_all / kept.value, 2)} times the shipped one (see docs/fit.md)" * far
+            return counted, f"{told}{part}: {number(n / of_all)} per hour ({limits}){beside}"
         needed = f", some {number(hours * FEWEST_COUNTED / n, 2)} h" if n else ""
         outside = not low <= kept.value <= high
         seen = {"note": f"{kept.note or kept.source}; {EXCLUDED}: {n} in {hours:.4g} h of following"}
