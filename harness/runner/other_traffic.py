@@ -180,6 +180,7 @@ def sensitivity(
 
 
 def _of_one(folder: Path, ranges: Ranges, progress: Progress, *, per_event: bool = False) -> Sensitivity:
+    """Bars of one run's numbers; ``per_event`` of rates per event, as a scenario's exposure has a bar of its own."""
     tested = StoredShells.of(folder, progress, _OPTION)
     require_shares(tested)
     settings, parameters = tested.here.campaign.environment, tested.here.parameters
@@ -200,7 +201,7 @@ def _of_one(folder: Path, ranges: Ranges, progress: Progress, *, per_event: bool
 
 
 def _of_sum(folder: Path, ranges: Ranges, progress: Progress) -> Sensitivity:
-    """Bars of each scenario, scaled by its share of the sum, and of the exposures; one that refuses has that alone."""
+    """Bars of the scenarios' exposures and, scaled by shares of the sum, of their numbers where these can be moved."""
     stored, bars = read_families(folder), list[Bar]()
     if not stored["n_crashes"]:  # the sum's upper limit is no sum of the scenarios' limits: none has a share of it
         mend = f"Ask {folder / next(iter(stored['families']))}, say, or harness estimate with --exposure."
@@ -213,9 +214,9 @@ def _of_sum(folder: Path, ranges: Ranges, progress: Progress) -> Sensitivity:
     if unknown := sorted(set(ranges).difference(*own_ranges.values())):
         mend = f"Ask {folder / next(iter(own_ranges))} alone, say: its table names its numbers."
         raise CampaignError("--range", unknown[0], "a number of one of these scenarios", mend)
-    hour = stored["beside"]["rate_per_hour"] or math.nan
+    reference_per_hour = stored["beside"]["rate_per_hour"] or math.nan
     for name, part in stored["families"].items():
-        shares = part["share"] or 0.0, part["reference_rate_per_hour"] / hour
+        shares = part["share"] or 0.0, part["reference_rate_per_hour"] / reference_per_hour
         exposure = part["exposure"]
         ends = float(f"{exposure['low']:.4g}"), float(f"{exposure['high']:.4g}")
         if ends[0] < ends[1]:
@@ -251,7 +252,7 @@ def _part(bar: Bar, share: float, driver_share: float) -> Bar:
 
 
 def moves(name: str, parameters: Parameters, shipped: Path, ranges: Ranges) -> Iterator[Move]:
-    """Moves of the uncertain numbers of an environment, which is so named, and of those with given ``ranges``."""
+    """Moves of the uncertain numbers of the environment ``name``, and of those with given ``ranges``."""
     numbers = parameters.numbers()
     given = {name.replace(".", "__"): ends for name, ends in ranges.items()}
     if unknown := sorted(set(given) - set(numbers)):

@@ -158,14 +158,11 @@ class StoredShells:
             references = ratio_of(other.references, base.references)
             crashing = new_p * crash_share
             # The pool's events are a sample: some of the same traffic lie beyond it, too, and do not count.
-            more_beyond = ratio_of(other.beyond, other.p, of_nothing=0.0) - ratio_of(
-                base.beyond, base.p, of_nothing=0.0
-            )
+            share_there, share_here = (ratio_of(each.beyond, each.p, of_nothing=0.0) for each in (other, base))
+            more_beyond = np.maximum(share_there - share_here, 0.0)
             with np.errstate(divide="ignore", over="ignore", invalid="ignore"):
                 off = np.expm1(np.abs(np.log(ratio_of(new_p @ shares, p @ shares) / references)))
-                beyond = float(
-                    crashing @ np.maximum(more_beyond, 0.0) / crashing.sum() + other.untested / other.p.sum()
-                )
+                beyond = float(crashing @ more_beyond / crashing.sum() + other.untested / other.p.sum())
             rate = self.rate(new_p) / self.rate(p)
             if not self.holds:
                 rate = self.limit(new_p, at_worst=True) / self.limit(p)
