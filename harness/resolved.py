@@ -1,6 +1,6 @@
-"""A campaign with all that its names stand for: refused at the door, or read once and handed on; no file is read again.
+"""A campaign with the content of all files that it names, which are read once, here.
 
-`require_ready` asks all that can be known before anything is simulated or written, `resolve` reads what is named.
+`resolve` reads them; `require_ready` also refuses what can be known to be wrong before anything is simulated or made.
 """
 
 from __future__ import annotations
@@ -24,14 +24,14 @@ from harness.worlds.system_libraries import require_libraries
 
 @dataclass(frozen=True, eq=False)
 class Resolved:
-    """A campaign, its library named if it left that to its traffic, and the content of the files that it names.
+    """A campaign, with its library named if it left that to its traffic, and the content of the files that it names.
 
-    ``parameters`` are the numbers of its ``environment``, as its family has them. ``av`` (1,) is the record of a
-    built-in AV, (0,) of any other; ``surrogates`` (J,) are the drivers that challenges are computed for.
-    ``challenge`` says how they are; a function or surrogates of the user's own by the hashes of their files.
-    ``content_hash`` is of all that changes an episode's bits, the environment's numbers included;
-    ``controller_sha256`` of the source of the AV's controller, None where there is none, or nobody has looked;
-    ``script`` is how often one of TraCI is asked (s), else 0.
+    ``parameters`` are the numbers of its ``environment``, as its family has them. ``av`` is (1,) the record of a
+    built-in AV, else (0,); ``surrogates`` (J,) are the drivers that challenges are computed for, and ``challenge`` how
+    they are, with the hashes of files for a function or surrogates of the user's own. ``content_hash`` is of all that
+    changes an episode's bits, the environment's numbers included; ``controller_sha256`` of the source of the AV's
+    controller, None where there is none, or before `require_ready`; ``script`` is the time between two calls of a TraCI
+    script (s), else 0.
     """
 
     campaign: Campaign
@@ -46,16 +46,18 @@ class Resolved:
 
     @property
     def family(self) -> Family:
-        """What kind of events the campaign tests."""
+        """The kind of events that the campaign tests."""
         return family_named(self.campaign.scenario)
 
     @property
     def scenario(self) -> Scenario:
         """What its tests have in common."""
         family, environment = self.family, self.environment
-        places = family.vehicles, family.principal, family.ahead
-        sizes = family.max_steps(environment), family.sideways_m(environment), family.shows(environment)
-        return Scenario(self.campaign.seed, *places, *sizes, self.av, family.columns)
+        return Scenario(
+            seed=self.campaign.seed, vehicles=family.vehicles, principal=family.principal, ahead=family.ahead,
+            max_steps=family.max_steps(environment), sideways_m=family.sideways_m(environment),
+            shows=family.shows(environment), driver=self.av, columns=family.columns,
+        )  # fmt: skip
 
     @cached_property
     def library(self) -> Library:
