@@ -56,7 +56,7 @@ class Section(BaseModel):
             raise in_words(error, cls) from None
 
     def __repr_args__(self) -> Iterator[tuple[str | None, Any]]:
-        """What is not as it would be if nobody had said anything."""
+        """The values that are not defaults."""
         for name, value in super().__repr_args__():
             field = type(self).model_fields[name or ""]
             if field.is_required() or value != field.get_default(call_default_factory=True):
@@ -315,10 +315,7 @@ class RunSettings(Section):
         return self.shard_size or USUAL_SHARD
 
     def shard_ends(self, n_episodes: int) -> Sequence[int]:
-        """Where the shards of so many episodes end; the last may end beyond them.
-
-        They follow from the index alone, so that a run can be continued.
-        """
+        """Where the shards of so many episodes, or a few more, end: by index alone, so that a run can go on."""
         if self.shard_size is not None:
             return range(self.shard_size, n_episodes + self.shard_size, self.shard_size)
         ends = [USUAL_SHARD]

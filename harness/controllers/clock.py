@@ -34,14 +34,11 @@ _LOADS = ("create_module", "exec_module")
 
 
 class Clock:
-    """Later by `LATER_S` at every call of a controller; or ``held``, but for 1 µs at each look: two runs see the same.
-
-    ``read_at`` says where the user's code has looked at it.
-    """
+    """Later by `LATER_S` at each call of a controller; or ``held``, but for 1 µs at each look: two runs see the same."""
 
     def __init__(self, *, held: bool) -> None:
         self._held, self._n_calls, self._n_looks = held, Guard.n_calls, 0
-        self.read_at: list[str] = []
+        self.read_at: list[str] = []  # places in the user's code
 
     def function(self, name: str, read: Callable[[], float]) -> Callable[[], float]:
         """What stands for the function of this name, which is ``read``."""

@@ -52,8 +52,8 @@ def own_code(
 ) -> Callable[..., Any]:
     """The class, or function, that a name stands for: ``my_av.py:Class`` or ``package.module:Class``.
 
-    Importable are this folder, as for a script, and that of a file. Raises `CampaignError`, of the key ``where`` and
-    ``what`` it has to be: there is no such module or class.
+    Importable are this folder, as for a script, and that of a file. Raises `CampaignError`, of the key ``where``: there
+    is no such module, or nothing in it that is ``what`` it has to be.
     """
     module_name, _, class_name = name.rpartition(":")
     is_file = module_name.endswith(".py")

@@ -51,23 +51,7 @@ def script_maker(av: AutomatedVehicle, guard: Guard) -> Callable[[], ScriptContr
     else:
         wrong = f"calls its vehicle {ego}, as one of the others is called" if ego in OTHERS else ""
     if wrong or ego is None:
-        found = f"{name}, which {wrong}"
-        expected, mend = "a script that commands one vehicle", "Name its vehicle: --set av.traci_style.ego=NAME."
-        if wrong.startswith(NEVER_DRIVES):
-            mend = "A test is one run of it from its first line: leave out steps that only wait. If it drives later, "
-            mend += f"--set av.traci_style.ego={ego}."
-        if wrong.startswith(FAILS):
-            expected = "a script that gets through a cut-in"
-            other = " If it asks for other vehicles, add --set av.traci_style.ego=NAME."
-            mend, line = "Fix the script in that line.", re.search(r":(\d+)\)", wrong)
-            if lacking := ", ".join(_lacking(name)):
-                mend = f"Take out, or replace, {lacking}: docs/controllers.md has the calls that are there."
-                if line is not None and f"(line {line[1]})" not in lacking:
-                    mend = f"Fix the script in that line. {mend}"
-            mend += other if "is not known" in wrong else ""
-            if re.search("unknown url type|FileNotFoundError", wrong):  # so says sumolib.net.readNet
-                mend += " A file that it reads itself must be there; the road is straight, of two lanes."
-        raise CampaignError("av.controller", found, expected, mend)
+        raise _unusable(name, wrong, ego)
 
     def vehicle(set_speed_mps: float, lv_name: str, bv_name: str) -> VehicleDomain:
         made = VehicleDomain(set_speed_mps, ego, lv_name, bv_name)
@@ -76,6 +60,25 @@ def script_maker(av: AutomatedVehicle, guard: Guard) -> Callable[[], ScriptContr
         return made
 
     return partial(ScriptController, script, vehicle)
+
+
+def _unusable(name: str, wrong: str, ego: str | None) -> CampaignError:
+    """The error of a script with which something is ``wrong``, and how to mend it."""
+    expected, mend = "a script that commands one vehicle", "Name its vehicle: --set av.traci_style.ego=NAME."
+    if wrong.startswith(NEVER_DRIVES):
+        mend = "A test is one run of it from its first line: leave out steps that only wait. If it drives later, "
+        mend += f"--set av.traci_style.ego={ego}."
+    if wrong.startswith(FAILS):
+        expected = "a script that gets through a cut-in"
+        mend, line = "Fix the script in that line.", re.search(r":(\d+)\)", wrong)
+        if lacking := ", ".join(_lacking(name)):
+            mend = f"Take out, or replace, {lacking}: docs/controllers.md has the calls that are there."
+            if line is not None and f"(line {line[1]})" not in lacking:
+                mend = f"Fix the script in that line. {mend}"
+        mend += " If it asks for other vehicles, add --set av.traci_style.ego=NAME." if "is not known" in wrong else ""
+        if re.search("unknown url type|FileNotFoundError", wrong):  # so says sumolib.net.readNet
+            mend += " A file that it reads itself must be there; the road is straight, of two lanes."
+    return CampaignError("av.controller", f"{name}, which {wrong}", expected, mend)
 
 
 def _lacking(name: str) -> Iterator[str]:
@@ -193,10 +196,7 @@ def _commanded(script: TraciScript, ego: str) -> tuple[_Tried, str]:
 
 
 def asked_for(av: AutomatedVehicle) -> tuple[int, float, int]:
-    """Steps of the harness in one of a script's, as it asks for before its first; 0 where it does not ask.
-
-    Then its hardest braking and idle steps, see `_Tried`.
-    """
+    """Steps of the harness in one that a script asks for, 0 if none; its hardest braking and idle steps (`_Tried`)."""
     script, ego = TraciScript(str(av.controller), dict(av.parameters)), av.traci_style.ego
     tried = _Tried(ego or _AnyName(VEH_ID))
     controller = ScriptController(script, lambda *_: tried)

@@ -217,13 +217,7 @@ def block_from_tables(
     """
     sampling = campaign.sampling
     alpha = np.array(campaign.mixture_weights, dtype=np.float64)
-    index = _integers(episodes, "episode")
-    if not index.size:
-        raise _damaged("episodes", "no rows", "at least one episode per shard")
-    if (gaps := np.diff(index) != 1).any():
-        row = int(np.argmax(gaps))
-        expected = "every episode once, in index order; a failed one is a row too"
-        raise _damaged(f"episodes, row {row + 1}", f"episode {index[row + 1]} after episode {index[row]}", expected)
+    index = _consecutive(episodes)
     outcome = outcome_places(episodes.column("outcome"), "episodes")
     failed = outcome == FAILED
     n_control_steps = _integers(episodes, "n_control_steps")
@@ -258,6 +252,18 @@ def block_from_tables(
     drawn = SamplingPlan(testing.method, alpha, cap, shells, above_mps, testing.epsilon, campaign.importance_names)
     block = Block(int(index[0]), outcome, _log_weights(episodes, failed, int(index[0])), columns, drawn)
     return block.harder_than(above_mps) if above_mps > 0.0 else block
+
+
+def _consecutive(episodes: pa.Table) -> IntArray:
+    """Indices of the episodes, each one more than the last."""
+    index = _integers(episodes, "episode")
+    if not index.size:
+        raise _damaged("episodes", "no rows", "at least one episode per shard")
+    if (gaps := np.diff(index) != 1).any():
+        row = int(np.argmax(gaps))
+        expected = "every episode once, in index order; a failed one is a row too"
+        raise _damaged(f"episodes, row {row + 1}", f"episode {index[row + 1]} after episode {index[row]}", expected)
+    return index
 
 
 def _damaged(where: str, found: str, expected: str) -> RunFolderError:

@@ -1,12 +1,12 @@
-"""Which crashes to look at first: in a table of a run, and of those that were traced a scene of the player.
+"""Which crashes to look at first: in a table of a run, and those that were traced in the player.
 
-Of a comparison those on which only one of the two crashes.
+In a comparison they are those on which only one of the two crashes.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -79,11 +79,7 @@ def crash_gallery(run: RunFolder, summary: RunSummary) -> tuple[list[GalleryRow]
     episodes = {int(episode[place]) for ranked in rankings.values() for place in ranked}
     traces = run.traces(episodes)
     traced = set() if traces is None else set(traces.column("episode").unique().to_pylist())
-    reasons: dict[int, list[str]] = {}
-    for reason, ranked in rankings.items():
-        chosen = sorted(enumerate(ranked, 1), key=lambda item: episode[item[1]] not in traced)[:SHOWN]
-        for rank, place in sorted(chosen):
-            reasons.setdefault(place, []).append(f"{reason} no. {rank}")
+    reasons = _reasons(rankings, [int(each) in traced for each in episode])
     total = float(crashes["weight"].sum())
     stored = run.crashes({int(episode[place]) for place in reasons} & traced)
     rows, shown = list[GalleryRow](), list[Scene]()
@@ -126,6 +122,16 @@ def _rankings(summary: RunSummary, stand_in: str, avoided: BoolArray, someone: B
         keys["weight"] = weight
     first = {f"avoidable by {stand_in}": worst_crashes(impact, episode, avoided[:, 0])} if avoided.size else {}
     return first | {name: worst_crashes(key, episode, among) for name, key in keys.items()}
+
+
+def _reasons(rankings: Mapping[str, list[int]], traced: Sequence[bool]) -> dict[int, list[str]]:
+    """Why a crash is shown, by its place: the first `SHOWN` of each ranking, ``traced`` ones before others."""
+    reasons: dict[int, list[str]] = {}
+    for reason, ranked in rankings.items():
+        chosen = sorted(enumerate(ranked, 1), key=lambda item: not traced[item[1]])[:SHOWN]
+        for rank, place in sorted(chosen):
+            reasons.setdefault(place, []).append(f"{reason} no. {rank}")
+    return reasons
 
 
 def _ends(run: RunFolder, scenes: Scenes, episode: FloatArray, impact: FloatArray) -> IntArray:
