@@ -34,7 +34,7 @@ _LOADS = ("create_module", "exec_module")
 
 
 class Clock:
-    """Later by `LATER_S` at each call of a controller; or ``held``, but for 1 µs at each look: two runs see the same."""
+    """Later by `LATER_S` at each call of a controller; or ``held``, but for 1 µs a look: two runs see the same."""
 
     def __init__(self, *, held: bool) -> None:
         self._held, self._n_calls, self._n_looks = held, Guard.n_calls, 0

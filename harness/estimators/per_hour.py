@@ -30,8 +30,8 @@ _GRID = 13
 class FamilyTests(NamedTuple):
     """Tests of one family, how often its events are met, and by which ``reading`` the competent driver acts.
 
-    A reading is a reference driver's name in the library; one that it lacks stands for its first. ``assumed`` moves
-    p_s.
+    A reading is a reference driver of the library by name; where it has none so called, its first one. ``assumed`` is
+    what is assumed of who cuts in, which moves the probabilities of strata.
     """
 
     family: str
