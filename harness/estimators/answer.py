@@ -156,9 +156,9 @@ def _of_rate(assumed: Assumed, best: Estimate) -> AssumedOfRate:
 def before_event(campaign: Campaign, manifest: Mapping[str, Any], counts: Mapping[str, int]) -> dict[str, Any]:
     """In how many tests a vehicle did each of `ACTS`; ``waits`` says whether it holds its speed while BV comes."""
     waits = bool(manifest.get("events_show")) and not campaign.av.acts_before_event
-    counted = {name: counts.get(name, 0) for name in ("n_events", *(f"n_{act}" for act in ACTS))}
+    acts = {name: counts.get(name, 0) for name in ("n_events", *(f"n_{act}" for act in ACTS))}
     built_in, script = campaign.av.model is not None, bool(manifest.get("script"))
-    return {"source": campaign.av.source, "built_in": built_in, "script": script, "waits": waits, **counted}
+    return {"source": campaign.av.source, "built_in": built_in, "script": script, "waits": waits, **acts}
 
 
 MANY = 0.1

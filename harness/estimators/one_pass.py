@@ -150,19 +150,19 @@ def asked_for(estimators: Iterable[Any], where: str) -> list[AnyEstimator]:
     return [each if isinstance(each, str) and each in ESTIMATORS else _own(each, where) for each in estimators]
 
 
-def _own(of: Any, where: str) -> OwnEstimator:
-    if isinstance(of, OwnEstimator):
-        return of
-    wanted, made = "a class with methods, add and result (see docs/estimators.md)", of
-    name = getattr(of, "__name__", type(of).__name__)
-    if isinstance(of, str):
+def _own(asked: Any, where: str) -> OwnEstimator:
+    if isinstance(asked, OwnEstimator):
+        return asked
+    wanted, made = "a class with methods, add and result (see docs/estimators.md)", asked
+    name = getattr(asked, "__name__", type(asked).__name__)
+    if isinstance(asked, str):
         installed = {each.name: each.value for each in entry_points(group="harness.estimators")}
-        if of not in installed and ":" not in of:
+        if asked not in installed and ":" not in asked:
             names = [*ESTIMATORS, *installed]
-            mend = did_you_mean(of, names) or "Write my.py:MyEstimator for one of your own."
-            raise HarnessError(where, f"'{of}'", f"one of {', '.join(map(repr, names))}, or my.py:MyEstimator", mend)
-        name = of.rpartition("/")[2]
-        made = own_code(installed.get(of, of), where, wanted)
+            mend = did_you_mean(asked, names) or "Write my.py:MyEstimator for one of your own."
+            raise HarnessError(where, f"'{asked}'", f"one of {', '.join(map(repr, names))}, or my.py:MyEstimator", mend)
+        name = asked.rpartition("/")[2]
+        made = own_code(installed.get(asked, asked), where, wanted)
     if missing := [each for each in ("methods", "add", "result") if not hasattr(made, each)]:
         raise HarnessError(where, f"{name} without {' and '.join(missing)}", wanted, "Add what is missing.")
     if isinstance(made.methods, str) or not {*made.methods} <= {*METHODS} - {"shells"}:

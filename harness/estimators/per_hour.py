@@ -278,7 +278,7 @@ class PerHour:
     def _beside(self, reference: str, level: Level, *, counts: bool) -> dict[str, Any]:
         ratio, low, high = self.ratio(level)
         if counts and math.isfinite(high):
-            low, high = self.limits_with_counts(level, lambda of, at: of.ratio(at)[1:])
+            low, high = self.limits_with_counts(level, lambda hour, at: hour.ratio(at)[1:])
         over = self.over_assumed()
         limits = None if over or math.isnan(ratio) else self.limits_over_assumed(level, ratio=True)
         return {

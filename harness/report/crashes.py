@@ -89,8 +89,8 @@ def crash_gallery(run: RunFolder, summary: RunSummary) -> tuple[list[GalleryRow]
         crash = {name: float(column[place]) for name, column in crashes.items()}
         number, component = int(episode[place]), int(crashes["component"][place])
         all_known = ends.size and (ends[place] != UNKNOWN).all()
-        names_of = [name for name, avoids in zip(family.stand_ins, avoided[place], strict=True) if avoids]
-        avoiders = ", ".join(names_of) or ("nobody" if all_known else "–")
+        who_avoid = [name for name, avoids in zip(family.stand_ins, avoided[place], strict=True) if avoids]
+        avoiders = ", ".join(who_avoid) or ("nobody" if all_known else "–")
         scene = None
         if traces is not None and number in traced:
             impact, scene = tenths(crash["impact_speed_mps"]), len(shown)

@@ -162,8 +162,8 @@ class Scenes:
             steps = np.flatnonzero(driven[:, 0])
             begins, until = (int(steps[0]), min(shown, int(steps[-1]))) if steps.size else (onset + 1, onset)
             own = driven[begins : until + 1].T
-            motion_of_it = {key: np.append(av[key][:begins], own[k]) for k, key in enumerate("xv")}
-            ghosts.append({"name": name, **motion_of_it, "crash": ended if ended == until else None})
+            moves = {key: np.append(av[key][:begins], own[k]) for k, key in enumerate("xv")}
+            ghosts.append({"name": name, **moves, "crash": ended if ended == until else None})
         return ghosts
 
 
