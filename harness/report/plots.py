@@ -185,11 +185,13 @@ def sensitivity_plot(sensitivity: Sensitivity) -> Plot:
     first, most = (int(np.abs(np.log(np.maximum(factors, low))).max(axis=0).argmax()) for factors in (rate, ratio))
     panel.add("boxes", "ink", np.maximum(ratio[0], low), ratio[1], *thin, label=f"its ratio to {sensitivity.driver}")
     panel.add("line", "muted", [1.0, 1.0], [down.low, down.high], dash=DASHED, width=1.0)
+    open_end = " (the other end is not known from these tests)"
+    of_rate, of_ratio = (open_end * bool(np.isnan(factors).any()) for factors in (shown[first].rate, shown[most].ratio))
     text = (
         "Fitted and counted numbers move over nine tenths of what their data leave open, assumed ones over the stated "
         f"range. The rate depends most on {names[first]}: × {number(rate[0][first], 2)} to × "
-        f"{number(rate[1][first], 2)}; its ratio to {sensitivity.driver} on {names[most]}: × "
-        f"{number(ratio[0][most], 3)} to × {number(ratio[1][most], 3)}."
+        f"{number(rate[1][first], 2)}{of_rate}; its ratio to {sensitivity.driver} on {names[most]}: × "
+        f"{number(ratio[0][most], 3)} to × {number(ratio[1][most], 3)}{of_ratio}."
     )
     return Plot("sensitivity", [panel], text, text)
 

@@ -224,6 +224,13 @@ def test_what_moves_the_rate_most_need_not_move_its_ratio():
     assert "its ratio to r157-cc on lateral.speed_median_mps: × 0.519 to × 3.69." in said
 
 
+def test_an_end_that_the_tests_do_not_say_is_not_given_as_one():
+    stops = Bar("braking.stop_share", "assumed", (0.0, 0.2), (0.305, np.nan), (0.359, np.nan), (0.5, 0.6), unlike=1)
+    said = sensitivity_plot(Sensitivity("", "smoke", "r157-cc", (stops,))).caption
+    assert "on braking.stop_share: × 0.30 to × 1.0 (the other end is not known" in said
+    assert said.count("the other end is not known") == 2
+
+
 @pytest.mark.parametrize("name", ["shells-twin", "forced-twin"])
 def test_the_map_holds_every_crash(name, stored_run):
     run = read_run_folder(stored_run(name))
