@@ -176,6 +176,19 @@ def test_a_braking_is_one_event_of_each_driver_who_follows(n_followers):
     assert BrakingFitter().seen(recording(led(np.minimum(v, again), n_followers))).events.size == n_followers
 
 
+@pytest.mark.parametrize("n_recordings", [1, 8])
+def test_that_events_are_of_one_vehicle_is_told(n_recordings):
+    """As of a test car that brakes again and again: they are not independent, as the limits take them to be."""
+    fitter, v = BrakingFitter(), np.full(4800, 32.0)
+    for at in range(200, 4700, 600):
+        braked(v, at, 5.0, 1.5, 8.0)
+    for i in range(n_recordings):
+        fitter.observe(recording(led(v if n_recordings == 1 else one_braking(at=200 + i))))
+    told = fitter.fitted(SimpleNamespace(out=Path("mine.yaml"), provenance=list), {}).told
+    assert "lead_brakes: 8 brakings" in told[0]
+    assert any("8 of 8 brakings of 3 m/s² or more are of one vehicle" in line for line in told) == (n_recordings == 1)
+
+
 def test_who_does_not_follow_meets_no_event():
     v = one_braking()
     rows = led(v)

@@ -14,7 +14,15 @@ from scipy import optimize, special
 
 from harness.campaign.sections import EnvironmentSettings
 from harness.families.cut_out.family import CUT_OUT, TTC_EDGES_S
-from harness.families.following.fitting import FEWEST_OF_LAW, FollowingFitter, Numbers, Seen, fitted_number, followed
+from harness.families.following.fitting import (
+    FEWEST_OF_LAW,
+    FollowingFitter,
+    Numbers,
+    Seen,
+    fitted_number,
+    followed,
+    most_of_one,
+)
 from harness.fitting.recording import Recording
 from harness.fitting.tracks import IN_VIEW_M, slope_weights
 from harness.vocabulary import FloatArray, IntArray, RecordArray
@@ -46,7 +54,8 @@ class CutOutFitter(FollowingFitter):
         events: RecordArray = np.empty(row.size, EVENT)
         events["drop"], events["ttc_s"] = closing / track.v[row], gap / np.maximum(closing, 1e-9)
         events["lateral_mps"] = np.abs(lateral_speeds(track, row))
-        return Seen(hours, events[(closing > 0.0) & (gap > 0.0) & (events["ttc_s"] <= TTC_EDGES_S[-1])])
+        counts = (closing > 0.0) & (gap > 0.0) & (events["ttc_s"] <= TTC_EDGES_S[-1])
+        return Seen(hours, events[counts], of_one=most_of_one(track.vehicle[row[counts]]))
 
     def share_counted(self, numbers: Numbers) -> float:
         fitted = {f"leaving__{name}": each["value"] for name, each in numbers.get("leaving", {}).items()}

@@ -29,6 +29,8 @@ from harness.vocabulary import BoolArray, IntArray, RecordArray
 
 FEWEST_COUNTED, FEWEST_OF_LAW = 5, 20
 """Fewest events from which a rate is taken, and a law [assumed]."""
+MOST_OF_ONE = 0.2
+"""Share of the events that are of one vehicle, above which they do not count as independent [assumed]."""
 TAIL = 0.05
 """At each end of the limits of a rate."""
 Numbers = dict[str, dict[str, Any]]
@@ -59,11 +61,20 @@ def followed(track: Recording) -> Followed:
 
 
 class Seen(NamedTuple):
-    """Hours of following in which events would have been seen, and the events; ``why`` a recording says nothing."""
+    """Hours of following in which events would have been seen, and the events; ``why`` a recording says nothing.
+
+    Of the events one vehicle has done ``of_one``, and none more.
+    """
 
     hours: float
     events: RecordArray
     why: str = ""
+    of_one: int = 0
+
+
+def most_of_one(vehicle: IntArray) -> int:
+    """Number of events of the vehicle that has most, by that of each event (k,)."""
+    return int(np.bincount(vehicle).max(initial=0))
 
 
 def fitted_number(value: float, se: float) -> dict[str, Any]:
@@ -113,6 +124,9 @@ class FollowingFitter:
         told += self._in_scope(content)
         silent, n = [each.why for each in self._seen if each.why], len(self._seen)
         more = [f"! {self.family.name}: {len(silent)} of {n} recordings are not counted: {silent[0]}"] if silent else []
+        if (of_one := max(each.of_one for each in self._seen)) > max(1, MOST_OF_ONE * events.size):
+            few = f"! {self.family.name}: {of_one} of {events.size} {self.events} are of one vehicle"
+            more.append(f"{few}: the limits, which take them to be independent, are too narrow")
         head = [f"{n - len(silent)} recordings.", told, f"The rest is as in {base}.", *asked.provenance()]
         [file] = self.marks(asked.out)
         text = environment_text(head, {"like": base, **content})
@@ -127,7 +141,7 @@ class FollowingFitter:
         low, high = (float(f"{end / max(of_all, 1e-9):.4g}") for end in garwood(n, TAIL))
         limits = f"{number(low, 2)} to {number(high, 2)}"
         if n >= FEWEST_COUNTED:
-            part = f", {share:.3g} of all by the law" * (share < 1.0)
+            part = f", {share:.3g} of all by the law" * (share < 0.9995)
             note = f"{n} in {hours:.4g} h of following{part}"
             rate = {**fitted_number(n / of_all, math.sqrt(n) / of_all), "range": [low, high], "note": note}
             counted = {"exposure": {"per_hour": rate, "events": n, "hours": round(of_all, 6)}}

@@ -13,7 +13,7 @@ import math
 import numpy as np
 from scipy import ndimage
 
-from harness.families.following.fitting import FollowingFitter, Numbers, Seen, fitted_number, followed
+from harness.families.following.fitting import FollowingFitter, Numbers, Seen, fitted_number, followed, most_of_one
 from harness.families.lead_brakes.family import LEAD_BRAKES
 from harness.fitting.recording import Recording
 from harness.fitting.tracks import noise_of, slope_weights
@@ -46,14 +46,15 @@ class BrakingFitter(FollowingFitter):
         hard, known = decelerations(track, SHORT_S if noise_of(track, SHORT_S) < PRECISE_MPS2 else 1.0)
         of = followed(track)
         (row, events), (up, _) = (brakings(each, known, track.piece) for each in (hard, -hard))
-        events, n_up = events[of.behind[row] >= 0], int((of.behind[up] >= 0).sum())
+        followed_by = of.behind[row] >= 0
+        events, n_up = events[followed_by], int((of.behind[up] >= 0).sum())
         hours = float((of.follows & known[of.ahead]).sum()) / track.rate_hz / 3600.0
         if (noise := noise_of(track)) > MOST_NOISE_MPS2:
             why = f"noise of {noise:.2g} m/s² in decelerations: at most {MOST_NOISE_MPS2:g} tell brakings from errors"
         elif n_up > max(1.0, MOST_UPWARD * events.size):
             why = f"{n_up} vehicles speed up by {LOWEST_MPS2:g} m/s² or more, and {events.size} brake so: errors"
         else:
-            return Seen(hours, events)
+            return Seen(hours, events, of_one=most_of_one(track.vehicle[row[followed_by]]))
         return Seen(0.0, events[:0], why)
 
     def numbers(self, events: RecordArray) -> Numbers:
