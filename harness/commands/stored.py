@@ -15,9 +15,6 @@ from harness.errors import EXIT_BAD_INPUT, HarnessError, WorldDisagreementError
 from harness.numbers import number, plain, share
 from harness.vocabulary import ESTIMATORS, FAMILIES
 
-LEAST_MOVE = 0.01
-"""Of a rate or ratio that a line is worth."""
-
 
 @click.command(
     short_help="Estimate again from a run's tests, also for other traffic.",
@@ -157,6 +154,9 @@ def sensitivity(folder: Path, *, ranges: dict[str, tuple[float, float]], as_json
     if as_json:
         print_json(content)
         return
+    from harness.estimators.traffic import LEAST_MOVE, NotMoved
+    from harness.report.rows import not_moved_words
+
     ends = [(bar, (*bar["rate"], *bar["ratio"])) for bar in content["bars"]]
     bars = [_bar(bar) for bar, times in ends if any(t is None or abs(t - 1.0) >= LEAST_MOVE for t in times)]
     n_still = len(content["bars"]) - len(bars)
@@ -169,6 +169,7 @@ def sensitivity(folder: Path, *, ranges: dict[str, tuple[float, float]], as_json
     usual = "the default traffic, " * (traffic in [family.default_parameters for family in families().values()])
     print_table(f"What moves the answer: {usual}{traffic}", bars)
     say(
+        *(not_moved_words(NotMoved(**each)) for each in content["not_moved"]),
         *([f"{still} neither by {share(LEAST_MOVE)}."] if n_still else ()),
         "Under 'rate' and 'ratio' (to the competent driver) the left value is by how much they are multiplied with the "
         "number at its lower end, the right one at its upper end; '–': only tests in that traffic would tell.",

@@ -109,6 +109,10 @@ def _log(value: float) -> float:
     return math.log(value) if 0.0 < value < math.inf else math.copysign(math.inf, value - 1.0)
 
 
+LEAST_MOVE = 0.01
+"""Change of rate or ratio from which a number of the traffic is shown."""
+
+
 @dataclass(frozen=True)
 class Bar:
     """A number, or a block of them, by how it is ``known``, and the factors of rate and ratio at its two ends.
@@ -140,6 +144,19 @@ def tests_of_sum(content: Mapping[str, Any]) -> str:
 
 
 @dataclass(frozen=True)
+class NotMoved:
+    """A scenario of several whose numbers were not moved, or not all: ``share`` is its part of the rate.
+
+    ``found`` and ``needed`` say why; both are empty where none of its tests crashed.
+    """
+
+    scenario: str
+    share: float
+    found: str = ""
+    needed: str = ""
+
+
+@dataclass(frozen=True)
 class Sensitivity:
     """Content of ``sensitivity.json``: bars, the longest first, and the driver whose ratio they are about."""
 
@@ -147,8 +164,9 @@ class Sensitivity:
     environment: str
     driver: str
     bars: tuple[Bar, ...] = ()
+    not_moved: tuple[NotMoved, ...] = ()
 
     @property
     def shown(self) -> list[Bar]:
-        """Bars of which these tests say something."""
-        return [bar for bar in self.bars if bar.span >= 0.0]
+        """Bars that these tests tell, and that move something."""
+        return [bar for bar in self.bars if bar.span >= LEAST_MOVE]

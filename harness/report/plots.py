@@ -14,6 +14,7 @@ from harness.families.protocol import Family
 from harness.families.words import Shown
 from harness.numbers import count, number, plain, share
 from harness.report.drawing import Plot, PlotAxis, PlotPanel
+from harness.report.rows import not_moved_words
 from harness.report.summary import RunFolder, RunSummary, ShownShells, summarise
 from harness.strata import ASSUMPTION_FREE
 from harness.vocabulary import CRASH, FAILED, BoolArray, FloatArray, IntArray
@@ -193,6 +194,7 @@ def sensitivity_plot(sensitivity: Sensitivity) -> Plot:
         f"{number(rate[1][first], 2)}{of_rate}; its ratio to {sensitivity.driver} on {names[most]}: × "
         f"{number(ratio[0][most], 3)} to × {number(ratio[1][most], 3)}{of_ratio}."
     )
+    text = " ".join([text, *map(not_moved_words, sensitivity.not_moved)])
     return Plot("sensitivity", [panel], text, text)
 
 

@@ -11,7 +11,7 @@ from harness.campaign.campaign import Campaign
 from harness.estimators.answer import AssumedOfRate, Estimates, before_event, n_softened
 from harness.estimators.estimate import Estimate
 from harness.estimators.severity import HARD_MPS, TOUCH_MPS, Severity
-from harness.estimators.traffic import TrafficError, Uncertain
+from harness.estimators.traffic import NotMoved, TrafficError, Uncertain
 from harness.families import family_named
 from harness.numbers import MISSING, count, interval, number, plain, ratio, share, tenths
 from harness.strata import ASSUMPTION_FREE, LIBRARY_STATEMENT
@@ -251,6 +251,16 @@ def bar_note(bar: Mapping[str, Any]) -> str:
     why = {"laws that give no probabilities": bar["no_laws"], "unlike what was tested": bar["unlike"]}
     note = " and ".join(reason for reason, n in why.items() if n)
     return f"{sum(why.values())} of {bar['n']}: {note}" if note and bar["values"] is None else note
+
+
+def not_moved_words(of: NotMoved) -> str:
+    """Which numbers of a scenario of several stand in no bar, and why."""
+    called = family_named(of.scenario).words.called
+    if not of.found:
+        return f"Of {called} no test crashed: its bars move the competent driver alone, and no bar the upper limit."
+    return (
+        f"Not moved: the numbers of {called}, {share(of.share)} of the rate (found: {of.found}; needed: {of.needed})."
+    )
 
 
 def too_few(n_replicates: int, confidence: float) -> tuple[str, ...]:

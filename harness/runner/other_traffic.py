@@ -7,7 +7,6 @@ is answered by the same tests, from few paths that are the same in all of them (
 from __future__ import annotations
 
 import math
-import sys
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -20,7 +19,16 @@ from harness.campaign.sections import Confidence
 from harness.errors import CampaignError
 from harness.estimators.answer import CARRIES, Elsewhere, estimate_blocks
 from harness.estimators.estimate import finite_json
-from harness.estimators.traffic import ONE_LAW, Bar, Sensitivity, TrafficError, Unseen, tests_of_sum, uncertain
+from harness.estimators.traffic import (
+    ONE_LAW,
+    Bar,
+    NotMoved,
+    Sensitivity,
+    TrafficError,
+    Unseen,
+    tests_of_sum,
+    uncertain,
+)
 from harness.families.protocol import Parameters
 from harness.pool.moved import assumed
 from harness.progress import Progress
@@ -202,7 +210,7 @@ def _of_one(folder: Path, ranges: Ranges, progress: Progress, *, per_event: bool
 
 def _of_sum(folder: Path, ranges: Ranges, progress: Progress) -> Sensitivity:
     """Bars of the scenarios' exposures and, scaled by shares of the sum, of their numbers where these can be moved."""
-    stored, bars = read_families(folder), list[Bar]()
+    stored, bars, not_moved = read_families(folder), list[Bar](), list[NotMoved]()
     if not stored["n_crashes"]:  # the sum's upper limit is no sum of the scenarios' limits: none has a share of it
         mend = f"Ask {folder / next(iter(stored['families']))}, say, or harness estimate with --exposure."
         raise CampaignError(_OPTION, "tests of which none crashed", "crashes, whose rate moves", mend)
@@ -224,21 +232,20 @@ def _of_sum(folder: Path, ranges: Ranges, progress: Progress) -> Sensitivity:
             known: Literal["counted", "assumed"] = "counted" if exposure["counted"] else "assumed"
             bars.append(_part(Bar(f"exposure {name}", known, ends, (low, high), (1.0, 1.0), (0.0, 0.0)), *shares))
         if not part["n_crashes"]:
-            why = "its bars move the competent driver alone, and what it adds to the upper limit stands in none"
-            sys.stderr.write(f"note: of {name} no test crashed: {why}\n")
+            not_moved.append(NotMoved(name, 0.0))
         progress.remark = f" ({name.replace('_', ' ')})"
         try:
             own = _of_one(folder / name, own_ranges[name], progress, per_event=True)
         except CampaignError as refused:
-            why = f"found: {refused.found}; needed: {refused.expected}"
-            sys.stderr.write(f"note: of the numbers of {name} only the exposure was moved ({why})\n")
+            not_moved.append(NotMoved(name, shares[0], str(refused.found), str(refused.expected)))
         else:
             for bar in own.bars:
                 what = bar.what if bar.what.startswith(f"{name}.") else f"{name} {bar.what}"
                 bars.append(_part(replace(bar, what=what), *shares))
     progress.remark = ""
     bars.sort(key=lambda bar: -bar.span)
-    return Sensitivity(tests_of_sum(stored), "crashes per hour", stored["beside"]["reference"], tuple(bars))
+    driver = stored["beside"]["reference"]
+    return Sensitivity(tests_of_sum(stored), "crashes per hour", driver, tuple(bars), tuple(not_moved))
 
 
 def _part(bar: Bar, share: float, driver_share: float) -> Bar:

@@ -13,12 +13,13 @@ from harness.errors import CampaignError, HarnessError, RunFolderError
 from harness.estimators.stopping import Decision
 from harness.estimators.traffic import Bar, Sensitivity
 from harness.families.words import EXCLUDED
-from harness.numbers import number
+from harness.numbers import number, share
 from harness.numbers import ratio as shown_ratio
 from harness.pool import moved
 from harness.printed import PRINTED
 from harness.progress import Progress
 from harness.records.folder import read_manifest, write_sealed
+from harness.report.rows import not_moved_words
 from harness.report.several import hour_lines
 from harness.resolved import resolve
 from harness.runner import other_traffic
@@ -260,14 +261,18 @@ def test_what_moves_one_scenario_moves_the_sum_by_its_share(run, tmp_path, monke
 
     monkeypatch.setattr("harness.runner.other_traffic._of_one", of_one)
     assert main(["sensitivity", str(folder), "--range", "braking.stop_share=0:0.1"]) == 0
-    said = capsys.readouterr().err
-    assert "of the numbers of cut_out only the exposure was moved (found: no number; needed: one)" in said
+    said = capsys.readouterr().out
+    left = f"Not moved: the numbers of cut-out, {share(told['families']['cut_out']['share'])} of the rate (found: no number"
+    assert left in said
+    assert left in (folder / "report.html").read_text()
     assert "no test crashed" not in said
     stored = read_families(folder)
     stored["families"]["cut_out"] |= {"n_crashes": 0}
     monkeypatch.setattr(other_traffic, "read_families", lambda _: stored)
-    other_traffic._of_sum(folder, {"braking.stop_share": (0.0, 0.1)}, Progress())
-    assert "note: of cut_out no test crashed: its bars move the competent driver alone" in capsys.readouterr().err
+    none, _ = other_traffic._of_sum(folder, {"braking.stop_share": (0.0, 0.1)}, Progress()).not_moved
+    assert not_moved_words(none) == (
+        "Of cut-out no test crashed: its bars move the competent driver alone, and no bar the upper limit."
+    )
     bars = {bar["what"]: bar for bar in json.loads((folder / "sensitivity.json").read_text())["bars"]}
     assert len(bars) == 3 + 2
     for name, of in told["families"].items():
