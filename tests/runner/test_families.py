@@ -262,7 +262,8 @@ def test_what_moves_one_scenario_moves_the_sum_by_its_share(run, tmp_path, monke
     monkeypatch.setattr("harness.runner.other_traffic._of_one", of_one)
     assert main(["sensitivity", str(folder), "--range", "braking.stop_share=0:0.1"]) == 0
     said = capsys.readouterr().out
-    left = f"Not moved: the numbers of cut-out, {share(told['families']['cut_out']['share'])} of the rate (found: no number"
+    of = share(told["families"]["cut_out"]["share"])
+    left = f"Not moved: the numbers of cut-out, {of} of the rate (found: no number"
     assert left in said
     assert left in (folder / "report.html").read_text()
     assert "no test crashed" not in said
