@@ -313,8 +313,8 @@ def script_step_s(av: AutomatedVehicle) -> float:
         note = f"looks at no vehicle in the first {idle_s:.1f} s of a test, in which a car may cut in"
         _tell_once(f"{file} {note}: a test is one run of it from its first line, so leave out steps that only wait")
     if math.isinf(hardest):
-        note = "sets a speed mode in which no decel bounds its braking; tests fail beyond av.limits"
-        _tell_once(f"{file} {note}: if one should, use mode 31, and --set av.traci_style.decel_mps2=8, say")
+        note = "sets a speed mode in which no decel bounds its braking, and a test fails where it is beyond av.limits"
+        _tell_once(f"{file} {note}; for a bound use mode 31, and --set av.traci_style.decel_mps2=8, say")
     elif hardest > bound and "decel_mps2" not in av.traci_style.model_fields_set:
         note = f"asks for harder braking than {bound:g} m/s², the decel of SUMO's default type, and gets that"
         _tell_once(f"{file} {note}; of another type: --set av.traci_style.decel_mps2=8, say")

@@ -63,7 +63,8 @@ class ReplayResult(ShownInPython):
 
     def _lines(self) -> list[str]:
         facts = [f"  {name:<18} {fact}" for name, fact in self.scene["facts"]]
-        return [f"test {self.row['episode']}: {self.outcome}", *facts]
+        ended = {"timeout": "time up, no crash", "bv_lv_contact": "BV ran into LV"}.get(self.outcome, self.outcome)
+        return [f"test {self.row['episode']}: {ended}", *facts]
 
 
 class Scenes:

@@ -93,7 +93,7 @@ def beside_row(
 
 
 def family_rows(content: Mapping[str, Any]) -> Iterator[tuple[str, ...]]:
-    """A row each: key, name, share of the rate, crashes per hour, ratio, how hard."""
+    """A row each: key, name, share of the rate, crashes per hour, ratio (its limits if 1 is between them), how hard."""
     order = sorted(content["families"].items(), key=lambda item: -(item[1]["rate_per_hour"] or 0.0))
     for name, family in order:
         per_hour, part, beside = family["rate_per_hour"], "0 %", "–"
@@ -102,6 +102,11 @@ def family_rows(content: Mapping[str, Any]) -> Iterator[tuple[str, ...]]:
             part = "" if family["share"] is None else share(family["share"])
             rate = f"{number(per_hour)}  {between(family['ci_low'], family['ci_high'], per_hour)}"
             beside = "–" if family["ratio"] is None else f"× {ratio(family['ratio'])}"
+            if family["ratio"] is not None and not _side(family):
+                most = "no limit" if family["ratio_high"] is None else number(family["ratio_high"], 2)
+                beside = f"× {number(family['ratio_low'], 2)}–{most}"
+            if (unseen := _unseen(family)) is not None:
+                rate = f"< {number(unseen[1])}  {number(per_hour)} as fitted"
         impact = family.get("median_impact_mps")
         hard = "no crash seen" if impact is None else f"median impact {tenths(impact)} m/s"
         yield name, called(name), part, rate, beside, hard
@@ -127,10 +132,16 @@ def sum_warnings(content: Mapping[str, Any]) -> Iterator[str]:
             yield f"beside {reading['reference']}, another reading of UN R157, it is × {times}"
     for name, family in content["families"].items():
         texts = list(words.warnings_of(name, {**family, "rate": family["rate_per_hour"]}, " per hour"))
-        if (stored := family.get("assumed")) and (assumed := AssumedOfRate(**stored)).no_lower_limit:
-            most = assumed.most * (family["ci_high"] if family["n_crashes"] else family["upper_bound"])
-            texts.append(f"{words.unseen_words(assumed.where)}, here {number(most)} per hour")
+        if (unseen := _unseen(family)) is not None:
+            texts.append(f"{words.unseen_words(unseen[0])}, here {number(unseen[1])} per hour")
         yield from (f"{called(name)}: {text}" for text in texts)
+
+
+def _unseen(family: Mapping[str, Any]) -> tuple[str, float] | None:
+    """Where no lane change was seen, if that leaves a scenario's rate without a lower limit, and its upper one."""
+    if not (stored := family.get("assumed")) or not (assumed := AssumedOfRate(**stored)).no_lower_limit:
+        return None
+    return assumed.where, assumed.most * (family["ci_high"] if family["n_crashes"] else family["upper_bound"])
 
 
 def _side(beside: Mapping[str, Any]) -> str:
@@ -151,17 +162,18 @@ def exposures(content: Mapping[str, Any]) -> str:
         if EXCLUDED in exposure["source"]:
             phrases[kind][-1] += f" ({EXCLUDED})"
         assumed = family["n_crashes"] and family.get("assumed")
-        if assumed and (others := looking_words(moved := AssumedOfRate(**assumed))):
+        if assumed and (others := looking_words(moved := AssumedOfRate(**assumed), " of these")):
             phrases[kind][-1] += f" (crashes × {number(moved.most, 2)} if {others})"
     parts = [f"{kind}: {', '.join(scenarios)}" for kind, scenarios in phrases.items()]
-    return "events per hour of driving, " + "; ".join([*parts, "other assumed numbers: harness sensitivity"])
+    return "events per hour of driving, " + "; ".join([*parts, "others: harness sensitivity"])
 
 
 def between(low: float, high: float | None, rate: float) -> str:
     """The interval of a rate; its ends apart where they are far apart, "no limit" where it is open."""
     if high is None:
         return f"≥ {number(low)}"
-    return interval(low, high, beside=rate) if low > 0.0 and high < 100.0 * low else f"{number(low)} to {number(high)}"
+    near = low > 0.0 and high < 100.0 * low
+    return interval(low, high, beside=rate) if near else f"{number(low, 2)} to {number(high, 2)}"
 
 
 def _scope(content: Mapping[str, Any]) -> str:

@@ -235,7 +235,7 @@ def test_what_other_traffic_does_to_a_scenario_is_said_once(run):
     """As in the answer of that scenario alone, but at as many events: there are 1.31 times as many per test, too."""
     content = run.content
     told = " ".join(" ".join(hour_lines(content)).split())
-    said = "cut-in 0.048 (crashes × 19 if 25 %, not 1 %, do not look behind); assumed: lead brakes 0.1"
+    said = "cut-in 0.048 (crashes × 19 if 25 %, not 1 %, of these do not look behind); assumed: lead brakes 0.1"
     assert told.count(said) == 1
     assert "25 %, not 1 %, do not look behind" in repr(run.runs["cut_in"])
     assert (run.folder / "report.html").read_text().count("× 19 if 25 %, not 1 %") == 1
