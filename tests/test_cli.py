@@ -301,11 +301,18 @@ def test_estimate_writes_only_when_asked(folder, capsys):
     assert estimates(folder)["confidence"] == 0.5
 
 
-def test_a_run_that_comes_to_no_verdict_is_an_error_in_place_of_an_earlier_one(tmp_path, capsys):
+@pytest.mark.parametrize(
+    ("command", "named"),
+    [
+        (["run", "tests.controllers.misbehaving:OnlyStepp", "--accept", "r157-cc"], "OnlyStepp"),
+        (["run", "no_such.yaml", "--accept", "r157-cc"], "no_such.yaml"),
+        (["compare", "idm", "no_such.yaml"], "no_such.yaml"),
+    ],
+)
+def test_a_run_that_comes_to_no_verdict_is_an_error_in_place_of_an_earlier_one(command, named, tmp_path, capsys):
     (verdict := tmp_path / "gate.xml").write_text("<testsuites/>")
-    asked = ["--accept", "r157-cc", "--junit", str(verdict), "--out", str(tmp_path / "run")]
-    assert main(["run", "tests.controllers.misbehaving:OnlyStepp", *asked]) == 2
+    assert main([*command, "--junit", str(verdict), "--out", str(tmp_path / "run")]) == 2
     (case,) = JUnitXml.fromfile(str(verdict))
     (error,) = next(iter(case)).result
-    assert "OnlyStepp" in error.message
+    assert named in f"{error.message} {case.name}"
     assert "error: " in capsys.readouterr().err

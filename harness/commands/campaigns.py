@@ -125,7 +125,8 @@ def run(
         *seeds,
         *overrides,
     ]
-    campaign = harness.load_campaign(campaign_file, [*given, *limit, *where], av=av)
+    with error_in(junit, str(campaign_file)):
+        campaign = harness.load_campaign(campaign_file, [*given, *limit, *where], av=av)
     if junit is not None and campaign.accept is None:
         say("note: without a limit (--accept) the JUnit file says only whether the run reached its end", err=True)
     folder = folder or options.run_folder(campaign, resume=resume)
@@ -212,13 +213,14 @@ def compare(
         read_manifest(stored)
     file_a = source_a if stored is None else stored / "campaign.yaml"
     overrides = [*options.of_scenario(scenario), *overrides]
-    a = harness.load_campaign(file_a, overrides, av=av)
     of_b = file_b or file_a
-    if names_a_campaign(file_a) and not names_a_campaign(of_b):  # a vehicle, driven as A's campaign says
-        b = harness.load_campaign(file_a, [*overrides, *against], av=str(of_b))
-        b = b.model_copy(update={"name": harness.load_campaign(of_b).name})
-    else:
-        b = harness.load_campaign(of_b, [*overrides, *against], av=av)
+    with error_in(junit, f"{source_a} and {of_b}"):
+        a = harness.load_campaign(file_a, overrides, av=av)
+        if names_a_campaign(file_a) and not names_a_campaign(of_b):  # a vehicle, driven as A's campaign says
+            b = harness.load_campaign(file_a, [*overrides, *against], av=str(of_b))
+            b = b.model_copy(update={"name": harness.load_campaign(of_b).name})
+        else:
+            b = harness.load_campaign(of_b, [*overrides, *against], av=av)
     if stored is not None:  # how far it was run before says nothing about now
         a = a.model_copy(update={"stop": b.stop})
     (vehicle_a, _), (vehicle_b, _) = vehicle_words(a.av), vehicle_words(b.av)

@@ -107,6 +107,8 @@ def _estimate_hours(
     from harness.runner.stored import estimate_families
 
     content, page = estimate_families(folder, exposures, confidence, counts=counts), None
+    if counts and not content["counts_in_interval"]:
+        say("note: no exposure here is counted: --exposure-uncertainty adds nothing to the interval", err=True)
     if write:
         from harness.records.folder import write_sealed
         from harness.report.page import write_hours

@@ -253,8 +253,9 @@ class PerHour:
         return PerHour([family._replace(exposure=e) for family, e in zip(self.families, own, strict=True)])
 
     def to_json(self, confidence: float, speed_mps: float, *, counts: bool = False) -> dict[str, Any]:
-        """All of it, as plain content; with ``counts`` those of exposures are in the interval of the sum."""
+        """All of it, as plain content; with ``counts`` those of counted exposures are in the interval of the sum."""
         level, (n, n_crashes, n_failed) = Level.two_sided(confidence), self.totals
+        counts = counts and any(family.exposure.counted for family in self.families)
         limits = self.limits(level)
         if counts:
             limits = limits._replace(**dict(zip(("low", "high"), self.limits_with_counts(level), strict=True)))

@@ -165,7 +165,7 @@ def exposures(content: Mapping[str, Any]) -> str:
         if assumed and (others := looking_words(moved := AssumedOfRate(**assumed), " of these")):
             phrases[kind][-1] += f" (crashes × {number(moved.most, 2)} if {others})"
     parts = [f"{kind}: {', '.join(scenarios)}" for kind, scenarios in phrases.items()]
-    return "events per hour of driving, " + "; ".join([*parts, "others: harness sensitivity"])
+    return "events per hour of driving, " + "; ".join([*parts, "other numbers: harness sensitivity"])
 
 
 def between(low: float, high: float | None, rate: float) -> str:

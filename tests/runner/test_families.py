@@ -146,6 +146,11 @@ def test_other_exposures_need_no_new_tests(run, capsys):
     assert "cut_in, lead_brakes, cut_out" in capsys.readouterr().err
     assert main(["estimate", str(run.folder), "--exposure", "lead_brakes=1,cut_in=2"]) == 2
     assert "Write --exposure lead_brakes=0.1, one each." in capsys.readouterr().err
+    given = ["--exposure", "cut_in=0.1", "--exposure-uncertainty"]
+    assert main(["estimate", str(run.folder), *given]) == 0
+    said = capsys.readouterr()
+    assert "note: no exposure here is counted" in said.err
+    assert "also of counted events" not in said.out
     assert main(["estimate", str(run.folder / "cut_in"), "--exposure", "cut_in=0.3"]) == 2
     assert "families.json" in capsys.readouterr().err
 
@@ -376,7 +381,8 @@ def test_a_rate_that_traffic_leaves_open_has_only_an_upper_limit_in_the_sum_too(
     told = " ".join(" ".join(hour_lines(content)).split())
     said = "! cut-in: no lane change was seen at TTC < 3 s in the data of this traffic: rates have only an upper limit"
     most = f", here {number(4.0 * of['cut_in']['ci_high'])} per hour"
-    assert [each in told for each in (said, said + most)] == [warned, warned]
+    row = f"< {number(4.0 * of['cut_in']['ci_high'])} {number(of['cut_in']['rate_per_hour'])} as fitted"
+    assert [each in told for each in (said, said + most, row)] == [warned] * 3
 
 
 def test_each_scenario_may_have_a_file_of_its_own(tmp_path):
@@ -387,7 +393,7 @@ def test_each_scenario_may_have_a_file_of_its_own(tmp_path):
     one = campaign("scenarios=[lead_brakes]", f"environments={{lead_brakes: {tmp_path / 'mine.yaml'}}}")
     told = hour_lines(run_here(one, tmp_path / "run").content)
     assert " in SUMO’s twin, 1 scenario · " in told[0]
-    assert "  events per hour of driving, given: lead brakes 0.3; other assumed" in "\n".join(told)
+    assert "  events per hour of driving, given: lead brakes 0.3; other numbers: harness" in "\n".join(told)
     (tmp_path / "mine.yaml").write_text("like: lead-brakes-1\nexposure: {per_hour: {value: 0.5, source: user}}\n")
     folder = tmp_path / "run"
     for again, of in ((estimate_families, folder), (other_traffic.sensitivity, folder / "lead_brakes")):
