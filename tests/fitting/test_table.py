@@ -16,7 +16,7 @@ from harness.errors import EXIT_BAD_INPUT, HarnessError, TrajectoryError
 from harness.families.cut_in.fitting.observations import BesideCounts, observe, require_enough
 from harness.fitting.distinct import fingerprint, require_distinct
 from harness.fitting.table import load_mapping, recordings
-from tests.fitting.trajectories import overtaking
+from tests.fitting.trajectories import overtaking, recording
 
 FEET = 1 / 0.3048
 ROWS = overtaking(2.5)
@@ -387,3 +387,12 @@ def test_classes_and_mirror(tmp_path):
     (tmp_path / "mirror.yaml").write_text("mirror: true\n")
     mirrored = judged(tmp_path / "mirrored.csv", str(tmp_path / "mirror.yaml"))
     assert mirrored == whole
+
+
+def test_directions_whose_lanes_are_numbered_the_other_way_are_counted():
+    """All together vehicles close in often enough on the side that is meant."""
+    rows = overtaking(0.5).query("recording_id < 2").astype({"vehicle_id": str, "recording_id": str})
+    alike = [recording(each) for _, each in rows.groupby("recording_id")]
+    turned = rows.assign(lane=np.where(rows.recording_id == "1", 1 - rows.lane, rows.lane))
+    assert [observe(each).tally.turned for each in alike] == [0, 0]
+    assert [observe(recording(each)).tally.turned for _, each in turned.groupby("recording_id")] == [0, 1]

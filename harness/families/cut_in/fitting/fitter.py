@@ -211,6 +211,9 @@ def _told(fit: Fit, tally: BesideCounts, asked: FitRequest, noise_mps2: float) -
     traffic, steps, unseen = fit.traffic, fit.acceptance, fit.environment.unseen
     side = "left" if asked.read.mirror else "right"
     noisy = f"! noise of {noise_mps2:.2g} m/s² in accelerations: the scatter of the fitted ones is off by as much"
+    turned = (
+        f"! in {tally.turned} directions of recordings vehicles close in on the other side: are lanes numbered alike?"
+    )
     limited = f"! no lane change seen at {unseen}: rates of crashes that begin there have only an upper limit"
     return (
         f"{traffic.n_recordings:,} recordings, {tally.vehicles:,} vehicles, {tally.driven_s / 3600.0:.2f} h beside the "
@@ -220,6 +223,7 @@ def _told(fit: Fit, tally: BesideCounts, asked: FitRequest, noise_mps2: float) -
         *(f"kept as in {BASE}: {what} ({why})" for what, why in fit.kept.items()),
         f"cut_in: exposure is not fitted: kept is {EXPOSURE.per_hour:g} per hour, counted in other trajectories",
         *([noisy] if noise_mps2 > MOST_NOISE_MPS2 else []),
+        *([turned] if tally.turned else []),
         *([limited] if unseen else []),
         *(f"! {words}" for words in too_few(asked.n_replicates, CONFIDENCE)),
     )

@@ -82,6 +82,8 @@ class BesideCounts(NamedTuple):
     """Whole seconds at risk with a time to collision below 8 s."""
     closing_other_s: float = 0.0
     """The same on the other side."""
+    turned: int = 0
+    """Directions of recordings in which it is nearly always on the other side."""
 
     @classmethod
     def of(cls, found: Iterable[Observations]) -> BesideCounts:
@@ -138,6 +140,9 @@ def observe(track: Recording) -> Observations:
     columns = state | {"vehicle": track.vehicle[rows], "duration_s": duration_s}
     columns |= {"acceleration_mps2": acceleration, "changes": crosses}
     fits, follows, behind, at_risk = (state[name] for name in ("fits", "follows", "behind", "at_risk"))
+    near = track.road[rows[whole & at_risk & (state["ttc_s"] < CLOSING_TTC_S)]]
+    far = track.road[other_rows[other["at_risk"] & (other["ttc_s"] < CLOSING_TTC_S)]]
+    closing, elsewhere = (np.bincount(of_road, minlength=track.road.max() + 1) for of_road in (near, far))
     leads, odd = _leads(track, rows[crosses & fits])
     overlaps = follows & (state["r1_m"] < OVERLAP_M)
     tally = BesideCounts(
@@ -150,8 +155,9 @@ def observe(track: Recording) -> Observations:
         changes=changes.size,
         used=int((at_risk & crosses).sum()),
         odd=odd,
-        closing_s=float((whole & at_risk & (state["ttc_s"] < CLOSING_TTC_S)).sum()),
-        closing_other_s=float((other["at_risk"] & (other["ttc_s"] < CLOSING_TTC_S)).sum()),
+        closing_s=float(near.size),
+        closing_other_s=float(far.size),
+        turned=int((elsewhere > OTHER_SIDE * np.maximum(closing, LEAST_CLOSING_S)).sum()),
     )
     return Observations(
         track.name,
