@@ -184,7 +184,7 @@ def print_table(title: str, rows: Sequence[Mapping[str, Any]]) -> None:
     table = Table(title=title)
     for heading, cell in rows[0].items():
         justify: Literal["left", "right"] = "left" if isinstance(cell, str) else "right"
-        table.add_column(heading.replace("_", " "), justify=justify, overflow="fold")
+        table.add_column(heading.replace("_", " "), justify=justify, overflow="fold", no_wrap=not table.columns)
     for row in rows:
         table.add_row(*(printable(words(cell, 4)) for cell in row.values()))
     console = Console()
