@@ -29,6 +29,8 @@ from harness.vocabulary import FloatArray, IntArray, RecordArray
 
 SHIPPED = CUT_OUT.parameters(EnvironmentSettings()).values()
 STANDS_MPS = 0.5
+LEAST_DROP = 0.002
+"""Least mean that is fitted, below which the exponentials overflow."""
 PRIOR_LOG_SD = 0.5
 """How wide the prior of a time's median and log-sd is [assumed]."""
 BOUNDS = [(math.log(low), math.log(high)) for low, high in ((0.1, 60.0), (0.01, 3.0))]
@@ -66,7 +68,7 @@ class CutOutFitter(FollowingFitter):
         drops = events["drop"][events["drop"] < 1.0 - STANDS_MPS / 30.0]
         careless = [SHIPPED[f"leaving__careless_{name}"] for name in ("share", "least_s", "most_s")]
         (median, log_sd), errors = time_law(events["ttc_s"], *careless)
-        found = {"drop_mean": fitted_number(drops.mean(), drops.mean() / math.sqrt(drops.size))}
+        found = {"drop_mean": fitted_number(*drop_law(drops))}
         found |= {"ttc_median_s": fitted_number(median, errors[0]), "ttc_log_sd": fitted_number(log_sd, errors[1])}
         logs = np.log(events["lateral_mps"][events["lateral_mps"] >= LEAST_LATERAL_MPS])
         if logs.size >= FEWEST_OF_LAW:
@@ -83,6 +85,18 @@ def lateral_speeds(track: Recording, rows: IntArray) -> FloatArray:
     inside = np.clip(around, 0, track.v.size - 1)
     known = (around == inside).all(axis=1) & (track.piece[inside[:, 0]] == track.piece[inside[:, -1]])
     return np.where(known, track.lateral[inside] @ weights, np.nan)
+
+
+def drop_law(drops: FloatArray) -> tuple[float, float]:
+    """Mean of the exponential law whose part below 1 has the mean of some drops (k,), and its standard error."""
+
+    def below_one(mean: float) -> float:
+        return mean - 1.0 / math.expm1(1.0 / mean)
+
+    seen = min(max(float(drops.mean()), below_one(LEAST_DROP)), below_one(1.0))
+    mean = optimize.brentq(lambda mean: below_one(mean) - seen, LEAST_DROP, 1.0)
+    slope = 1.0 - math.exp(1.0 / mean) / (mean * math.expm1(1.0 / mean)) ** 2
+    return mean, mean / math.sqrt(drops.size * slope)  # the drops' variance is mean² slope
 
 
 def share_within(median_s: float, log_sd: float, careless: float) -> float:
