@@ -1,6 +1,6 @@
-"""Arguments of the functions that a user calls from Python, held against their annotations before anything is done.
+"""Arguments of the functions that a user calls from Python, checked against their annotations before anything is done.
 
-A number of numpy's is taken as the plain one that it stands for. A path may be a text.
+A numpy number counts as the plain number of its value. A path may be given as text.
 """
 
 from __future__ import annotations
@@ -36,15 +36,15 @@ def checked(name: str) -> Callable[[Callable[P, R]], Callable[P, R]]:
 
     def decorated(function: Callable[P, R]) -> Callable[P, R]:
         @wraps(function)
-        def call(*given: P.args, **named: P.kwargs) -> R:
+        def call(*args: P.args, **kwargs: P.kwargs) -> R:
             takes, adapters = _expected(function)
             try:
-                bound = takes.bind(*given, **named)
+                bound = takes.bind(*args, **kwargs)
             except TypeError as error:
-                unknown = next((key for key in named if key not in takes.parameters), "")
+                unknown = next((key for key in kwargs if key not in takes.parameters), "")
                 mend = did_you_mean(unknown, list(takes.parameters)) or "Correct the call: what has a = goes by name."
-                told = (f"{of.name}{'=' * (of.kind is of.KEYWORD_ONLY)}" for of in takes.parameters.values())
-                raise HarnessError(name, str(error), f"arguments {', '.join(told)}", mend) from None
+                names = (f"{p.name}{'=' * (p.kind is p.KEYWORD_ONLY)}" for p in takes.parameters.values())
+                raise HarnessError(name, str(error), f"arguments {', '.join(names)}", mend) from None
             for key in bound.arguments.keys() & adapters.keys():
                 bound.arguments[key] = _checked(f"{name}({key}=…)", bound.arguments[key], *adapters[key])
             return function(*bound.args, **bound.kwargs)
@@ -56,11 +56,10 @@ def checked(name: str) -> Callable[[Callable[P, R]], Callable[P, R]]:
 
 @cache
 def _expected(function: Callable[..., Any]) -> tuple[Signature, dict[str, tuple[TypeAdapter[Any], bool]]]:
-    """What a function takes; by argument what holds a value against its annotation, and whether that is a path."""
-    of_arguments = {key: hint for key, hint in function.__annotations__.items() if key != "return"}
-    hints = get_type_hints(
-        SimpleNamespace(__annotations__=of_arguments), getattr(function, "__globals__", {}), include_extras=True
-    )
+    """Signature of a function; by argument the validator of its annotation, and whether the argument is a path."""
+    annotations = {key: hint for key, hint in function.__annotations__.items() if key != "return"}
+    arguments = SimpleNamespace(__annotations__=annotations)
+    hints = get_type_hints(arguments, getattr(function, "__globals__", {}), include_extras=True)
     return signature(function), {key: (_adapter(hint), Path in (hint, *get_args(hint))) for key, hint in hints.items()}
 
 
@@ -70,7 +69,7 @@ def _adapter(hint: Any) -> TypeAdapter[Any]:
 
 
 def _kind(hint: Any) -> Any:
-    """The annotation with classes of the harness's as such: their instances have been validated."""
+    """The annotation, in which classes stand for instances of theirs: these have been validated when they were made."""
     if get_origin(hint) in (Union, UnionType):
         return Union[tuple(map(_kind, get_args(hint)))]  # noqa: UP007 - made of what is known only here
     return cast(Any, InstanceOf)[hint] if isinstance(hint, type) and hint not in _PLAIN else hint
@@ -79,20 +78,18 @@ def _kind(hint: Any) -> Any:
 def _checked(where: str, value: Any, adapter: TypeAdapter[Any], is_path: bool) -> Any:
     plain = value.item() if getattr(value, "shape", None) == () else value
     try:
-        found = adapter.validate_python(plain)
+        validated = adapter.validate_python(plain)
     except ValidationError as error:
-        first, *others = error.errors(include_url=False)
-        expected = " or ".join(dict.fromkeys(_words(each, is_path=is_path) for each in (first, *others)))
+        first, *rest = error.errors(include_url=False)
+        expected = " or ".join(dict.fromkeys(_words(problem, is_path=is_path) for problem in (first, *rest)))
         mend = did_you_mean(first["input"], re.findall("'(.*?)'", expected)) or "Correct the argument."
         mend = f"Write [{plain!r}]." if first["type"] == "sequence_str" else mend
         raise HarnessError(where, describe_found(first["input"]), expected, mend) from None
-    if is_path and isinstance(found, str | Path) and (not str(found) or not _is_text(str(found))):
-        raise HarnessError(where, f"'{found}'", "the name of a file or folder, in UTF-8", "Correct the argument.")
-    return found
-
-
-def _is_text(name: str) -> bool:
-    return "\0" not in name and name.encode(errors="replace").decode() == name
+    if is_path and isinstance(validated, str | Path):
+        name = str(validated)
+        if not name or "\0" in name or name.encode(errors="replace").decode() != name:
+            raise HarnessError(where, f"'{name}'", "the name of a file or folder, in UTF-8", "Correct the argument.")
+    return validated
 
 
 def _words(problem: ErrorDetails, *, is_path: bool) -> str:

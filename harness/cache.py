@@ -1,8 +1,8 @@
-"""What can be made again, kept from run to run: compiled kernels, challenge tables, pools; nothing else is kept there.
+"""The cache: what is kept from run to run because it can be made again. Compiled kernels, challenge tables, pools.
 
-A file ends with a checksum of its name and content. One that is damaged, or is another's, is as good as none: what it
-held is made anew. What cannot be written where it should be goes to a folder of this user among the temporary files, so
-that a folder that may only be read is a cache, too, and a user without a home has one.
+A file ends with a checksum of its name and content. One that is damaged, or has another's name, is ignored, and its
+content made anew. Where the cache cannot be written, files go to a folder of this user among the temporary files. So a
+cache may be read-only, and a user without a home folder has one, too.
 """
 
 from __future__ import annotations
@@ -27,19 +27,19 @@ from harness.files import checksum, write_atomically
 FOLDER = "HARNESS_CACHE_DIR"
 """Environment variable that names the cache; the default is the user's own, if there is a home to have it in."""
 SAID = "HARNESS_CACHE_SAID"
-"""Environment variable that keeps a process from saying what another of the same command has said, or will say."""
+"""Environment variable, set where another process of the same command prints the note about where the cache is."""
 MOST_BYTES = 4 << 30
-"""That files of one kind may take up [assumed]: tables of a challenge are 110 MB for each traffic."""
+"""Most bytes of files of one kind [assumed]: tables of a challenge are 110 MB for each traffic."""
 _LOOK_S = 0.1
-"""Time between two looks at whether another process has done what is waited for."""
+"""Time between two looks at whether another process has released its lock."""
 _SEAL_BYTES, _SEALED = 4, 0x2144DF1C
-"""The CRC-32 of whatever ends with its own is always this."""
+"""The CRC-32 of any bytes that end with their own CRC-32 is this number."""
 
 
 def own_folder() -> Path | None:
     """Where the cache should be; None where there is no home folder."""
-    if named := os.environ.get(FOLDER):
-        return Path(named)
+    if folder := os.environ.get(FOLDER):
+        return Path(folder)
     with suppress(RuntimeError):  # nobody knows where this user is at home
         path = platformdirs.user_cache_path("harness")
         return path if path.is_absolute() else None  # so say older versions of that package
@@ -61,8 +61,8 @@ def _spare_folder(*, make: bool = False) -> Path:
     if make:
         with suppress(FileExistsError):
             folder.mkdir(0o700)
-    found = folder.lstat()
-    if not stat.S_ISDIR(found.st_mode) or found.st_uid != os.geteuid() or found.st_mode & 0o077:
+    status = folder.lstat()
+    if not stat.S_ISDIR(status.st_mode) or status.st_uid != os.geteuid() or status.st_mode & 0o077:
         mend = f"Remove it, or set {FOLDER} or TMPDIR to another folder."
         raise HarnessError(str(folder), "what is not this user's alone", "a folder that nobody else can write to", mend)
     return folder
@@ -110,9 +110,9 @@ def keep(name: str, content: bytes | memoryview) -> Path:
             file.write(content)
             file.write(zlib.crc32(content, zlib.crc32(name.encode())).to_bytes(_SEAL_BYTES, "little"))
 
-    kept = put(name, lambda path: write_atomically(path, write))
-    _make_room(kept)
-    return kept
+    path = put(name, lambda path: write_atomically(path, write))
+    _make_room(path)
+    return path
 
 
 def _used(path: Path) -> None:
@@ -121,32 +121,32 @@ def _used(path: Path) -> None:
 
 
 def _make_room(kept: Path) -> None:
-    """Remove what has not been used for longest of what lies beside a file, where all is more than `MOST_BYTES`."""
+    """Remove the files beside a new one that were last used longest ago, until all are within `MOST_BYTES`."""
     beside = []
     for path in kept.parent.glob("[!.]*"):  # not what others are just writing
         with suppress(OSError):  # another process has removed it
             beside.append((path.stat(), path))
-    left = sum(of.st_size for of, _ in beside) - MOST_BYTES
-    for of, path in sorted(beside, key=lambda each: each[0].st_mtime):
-        if left > 0 and path != kept:
+    excess = sum(status.st_size for status, _ in beside) - MOST_BYTES
+    for status, path in sorted(beside, key=lambda entry: entry[0].st_mtime):
+        if excess > 0 and path != kept:
             with suppress(OSError):
                 path.unlink()
-                left -= of.st_size
+                excess -= status.st_size
 
 
 @contextmanager
 def made_once(name: str, waits: Callable[[str], object], most_s: float = math.inf) -> Iterator[None]:
-    """Keep other processes from making the same meanwhile; ``waits`` is told which of them is at it already.
+    """Hold a lock, so that no other process makes the same at the same time.
 
-    One that takes longer than ``most_s``, as it may have been stopped, is not waited for.
+    ``waits`` is called with who holds it already. It is waited for at most ``most_s``: that process may be stopped.
     """
-    with ExitStack() as held:
-        # Without a lock is a cache that may only be read or does not exist yet, and a file system that has none.
+    with ExitStack() as stack:
+        # There is no lock in a cache that is read-only or does not exist yet, or on a file system without locks.
         with suppress(OSError, StopIteration):
             path = next(places(name))
             path = path.with_name(f".{path.name}.lock")
             path.parent.mkdir(parents=True, exist_ok=True)
-            file = held.enter_context(path.open("ab+"))  # a pipe would wait for who reads it
+            file = stack.enter_context(path.open("ab+"))  # a pipe would wait for who reads it
             until = None
             while True:
                 try:
@@ -159,7 +159,7 @@ def made_once(name: str, waits: Callable[[str], object], most_s: float = math.in
                     if time.monotonic() >= until:
                         raise
                     time.sleep(_LOOK_S)
-            held.callback(path.unlink, missing_ok=True)
+            stack.callback(path.unlink, missing_ok=True)
             file.truncate(0)
             file.write(str(os.getpid()).encode())
             file.flush()
@@ -167,7 +167,7 @@ def made_once(name: str, waits: Callable[[str], object], most_s: float = math.in
 
 
 def _holder(path: Path) -> str:
-    """Who has locked a file, and since when; which may be over by now."""
+    """Who locked a file, and since when; the lock may be released by now."""
     with suppress(OSError):
         if pid := path.read_text():
             return f"process {pid}, since {time.strftime('%H:%M:%S', time.localtime(path.stat().st_mtime))}"

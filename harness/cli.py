@@ -66,19 +66,19 @@ def main(arguments: Sequence[str] | None = None, group: click.Group = cli, name:
 
 
 def _told(error: Exception, group: click.Group, name: str) -> int:
-    """Exit code of an error that a user has been told; a defect leaves as it is."""
+    """Show a user's error and return its exit code; a defect is raised again."""
     if isinstance(error, click.exceptions.NoArgsIsHelpError):
         error.show()
         return error.exit_code
     if isinstance(error, BrokenPipeError):
         go_on_unread(sys.stdout)
         return EXIT_DONE
-    known = error if isinstance(error, HarnessError) else None
+    user_error = error if isinstance(error, HarnessError) else None
     if isinstance(error, click.UsageError):
-        known = usage_error(error, error.ctx or click.Context(group, info_name=name))
+        user_error = usage_error(error, error.ctx or click.Context(group, info_name=name))
     elif isinstance(error, OSError | MemoryError):
-        known = system_error(error)
-    if known is None:
+        user_error = system_error(error)
+    if user_error is None:
         raise error
-    show_error(known)
-    return known.exit_code
+    show_error(user_error)
+    return user_error.exit_code

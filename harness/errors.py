@@ -19,7 +19,7 @@ EXIT_BUDGET_SPENT = 4
 EXIT_REFUTED = 5
 
 OF_THE_DISK = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)
-"""Errors of the system that tell of the disk, not of the file."""
+"""Errors of the operating system about the disk, not the file."""
 MEND_PART = "Delete this file and run again with --resume: the same tests are made anew."
 LONGEST_PART = 400
 """Characters of a part of a message: five lines of a terminal. What a user typed may be as long as they like."""
@@ -36,7 +36,7 @@ def printable(text: str) -> str:
     So are marks that turn the direction of writing, and halves of surrogate pairs, which no encoding has. JSON stays
     the same JSON.
     """
-    return _CONTROL.sub(lambda found: f"\\u{ord(found.group()):04x}", text)
+    return _CONTROL.sub(lambda match: f"\\u{ord(match.group()):04x}", text)
 
 
 def shortened(text: str, most: int = LONGEST_PART) -> str:
@@ -80,7 +80,7 @@ class HarnessError(Exception):
 
 @contextmanager
 def told_of(whom: str) -> Iterator[None]:
-    """Let an error say of which of several vehicles or scenarios it is."""
+    """Add to an error which of several vehicles or scenarios it is about."""
     try:
         yield
     except HarnessError as error:

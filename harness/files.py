@@ -18,16 +18,16 @@ _UNFINISHED = ".harness-{}.part"
 """A file that is being written; nobody else's temporary files have such names."""
 _BLOCK_BYTES = 1 << 20
 _ABOUT_TO_BE_S = 60.0
-"""Age from which an empty one is no longer about to be locked."""
+"""Age from which an unlocked, empty file is not one that is just being begun."""
 
 
 def real_path(path: Path | str) -> Path:
-    """The path without links; of links that lead in a circle as far as it goes, for whoever opens it to complain."""
+    """The path without links; links in a circle stay, so that opening it fails."""
     return Path(os.path.realpath(path))
 
 
 def checksum(path: Path, crc: int = 0) -> int:
-    """CRC-32 of a file's bytes, and of what had ``crc`` before them."""
+    """CRC-32 of a file's bytes, going on from ``crc``, that of bytes before them."""
     with path.open("rb") as file:
         while block := file.read(_BLOCK_BYTES):
             crc = zlib.crc32(block, crc)
@@ -59,8 +59,8 @@ def remove_unfinished(files: Iterable[Path]) -> None:
     for path in files:
         with suppress(OSError), path.open("rb+") as file:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            found = path.stat()
-            if found.st_size or time.time() - found.st_mtime > _ABOUT_TO_BE_S:
+            status = path.stat()
+            if status.st_size or time.time() - status.st_mtime > _ABOUT_TO_BE_S:
                 path.unlink()
 
 

@@ -47,7 +47,7 @@ def number(value: float | None, digits: int = 3, *, exponent: int | None = None,
 def interval(low: float | None, high: float | None, point: float | None = None, *, beside: float | None = None) -> str:
     """``(1.17 to 1.29) × 10⁻⁷``, or ``1.23 (1.17 to 1.29) × 10⁻⁷``: in one power of ten.
 
-    It is that of the rate that stands ``beside`` it; ends that are far apart have each their own.
+    The power is that of the rate that stands ``beside`` it; ends that are far apart have one each.
     """
     if low is None or high is None or not (math.isfinite(low) and math.isfinite(high)):
         return f"{number(low)} to {number(high)}"
@@ -138,6 +138,6 @@ def words(content: Any, digits: int | None = None) -> str:
     if isinstance(content, int):
         return str(content) if digits is None and abs(content) < 10_000 else f"{content:,}"
     if isinstance(content, list):
-        shown = ", ".join(words(item, digits) for item in content[:_LISTED])
-        return f"{shown}, … ({len(content)} values)" if len(content) > _LISTED else shown
+        items = ", ".join(words(item, digits) for item in content[:_LISTED])
+        return f"{items}, … ({len(content)} values)" if len(content) > _LISTED else items
     return str(content)

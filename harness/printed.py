@@ -12,7 +12,7 @@ from typing import ClassVar
 PRINTED = "printed.txt"
 """What processes have printed, in a run folder."""
 PRINTED_BYTES = 65_536
-"""Of what a process prints first, and of what it prints last, that is passed on."""
+"""Bytes of what a process prints first, and again of what it prints last, that are passed on."""
 _LOOK_S = 0.5
 """Time between two looks at whether the process has ended."""
 
@@ -24,20 +24,20 @@ class Kept:
         self.text, self.n_lines, self._lock = bytearray(), 0, threading.Lock()
 
     def add(self, text: bytes, n_lines: int) -> None:
-        """Text of one of them, which stands for so many lines."""
+        """Add text of one process, which printed ``n_lines`` lines in all."""
         with self._lock:
             self.text += text
             self.n_lines += n_lines
 
 
 class Printed:
-    """What a process prints: its first 64 kB pass on at once, its last 64 kB in the end, no more of it.
+    """What a process prints: passes on its first 64 kB at once, its last 64 kB at the end, and drops the rest.
 
-    They go to stderr, or are ``kept``. The process writes to the ``pipe``, which is to be closed here once it has it.
+    It goes to stderr, or into ``kept``. The process writes to the ``pipe``, to be closed here after it is handed over.
     """
 
     kept: ClassVar[Kept | None] = None
-    """By what begins meanwhile."""
+    """Where the output of processes goes that begin while it is set."""
 
     def __init__(self) -> None:
         self._to_others = _to_stderr if self.kept is None else self.kept.add
@@ -52,10 +52,11 @@ class Printed:
         self._thread.join()
 
     def _pass_on(self) -> None:
-        left, last, n_lost = PRINTED_BYTES, bytearray(), 0
+        room = PRINTED_BYTES
+        last, n_lost = bytearray(), 0
         while chunk := self._next():
-            first, rest = chunk[:left], chunk[left:]
-            left -= len(first)
+            first, rest = chunk[:room], chunk[room:]
+            room -= len(first)
             last += rest
             n_lost += max(0, len(last) - PRINTED_BYTES)
             del last[:-PRINTED_BYTES]
@@ -64,7 +65,7 @@ class Printed:
         self._to_others(f"\n[{n_lost:,} bytes more that a worker has printed]\n".encode() * bool(n_lost) + last, 0)
 
     def _next(self) -> bytes:
-        """What it has printed since; nothing once all is told."""
+        """What the process has printed since the last call; empty at the end."""
         while not wait([self._read], _LOOK_S):
             if self._is_over.is_set():
                 return b""

@@ -1,7 +1,7 @@
 """What is wrong with a section, in words: found, expected, how to mend.
 
-Every section puts the errors of its own keys into words (`in_words`), for it knows what they mean. Place and line come
-to them in `harness.campaign.files`, which reads the file.
+Every section puts the errors of its own keys into words (`in_words`), for it knows what they mean.
+`harness.campaign.files`, which reads the file, adds place and line.
 """
 
 from __future__ import annotations
@@ -41,14 +41,14 @@ MOST_SHOWN = 20
 
 
 def broken_rule(key: str, found: str, expected: str, mend: str) -> PydanticCustomError:
-    """Parts of a `HarnessError` about a section; ``key`` is the dotted path within, empty for the section itself."""
+    """An error of validation with the parts of a `HarnessError`; ``key`` is a path within the section, or empty."""
     parts = {"key": key, "found": found, "expected": expected, "mend": mend}
     where = "{key}: " if key else ""
     return PydanticCustomError("broken_rule", where + "found {found}; expected {expected}. {mend}", parts)
 
 
 def in_words(error: ValidationError, section: type[BaseModel]) -> ValidationError:
-    """The error of a section with those of its own keys in words, as of a `broken_rule`."""
+    """The error of a section, each of its parts in words, as a `broken_rule` has them."""
     worded = []
     for details in error.errors(include_url=False)[:MOST_SHOWN]:
         parts = details["ctx"] if details["type"] == "broken_rule" else _parts(details, section)
@@ -59,15 +59,18 @@ def in_words(error: ValidationError, section: type[BaseModel]) -> ValidationErro
 def _parts(details: ErrorDetails, section: type[BaseModel]) -> dict[str, str]:
     """Found, expected and how to mend it, of an error about a key of a section."""
     kind, loc, value, context = details["type"], details["loc"], details["input"], details.get("ctx", {})
-    field, last = section.model_fields.get(str(loc[0])) if loc else None, str(loc[-1]) if loc else ""
-    key, found = "", describe_found(value)
+    field = section.model_fields.get(str(loc[0])) if loc else None
+    last = str(loc[-1]) if loc else ""
+    key = ""
+    found = describe_found(value)
     mend = _how_to_mend(value, kind, field)
     if kind == "missing":
         key, found, mend = last, "no such key", f"Add '{last}: …' to this section."
         expected = (field and field.description) or "a value"
     elif kind == "extra_forbidden":
-        found, known = f"the unknown key '{last[:_LONGEST]}'", list(section.model_fields)
-        expected, mend = f"one of the keys {', '.join(known)}", did_you_mean(last, known)
+        keys = list(section.model_fields)
+        found, expected = f"the unknown key '{last[:_LONGEST]}'", f"one of the keys {', '.join(keys)}"
+        mend = did_you_mean(last, keys)
     elif kind == "model_type":
         expected = f"a section with keys such as {', '.join(list(section.model_fields)[:4])}"
         mend = f"Write {example} there." if (example := getattr(section, "example", "")) else mend
@@ -108,29 +111,29 @@ def _how_to_mend(value: Any, kind: str, field: FieldInfo | None) -> str:
 
 def did_you_mean(word: object, words: Sequence[str]) -> str:
     """The closest of some words, as a question; empty if none is close."""
-    asked = str(word)[:_LONGEST]
-    return f"Did you mean '{meant}'?" if (meant := nearest(asked, words)) else ""
+    text = str(word)[:_LONGEST]
+    return f"Did you mean '{meant}'?" if (meant := nearest(text, words)) else ""
 
 
 def nearest(word: str, words: Sequence[str]) -> str:
     """The closest of some words, whatever their case, - and _; empty if none is close."""
     word = re.sub("max_(braking|decel|deceleration)(?=_|$)", "min_acceleration", word)
-    flat = {each.lower().replace("-", "_"): each for each in reversed(words)}
+    by_spelling = {spelling.lower().replace("-", "_"): spelling for spelling in reversed(words)}
     cutoff = 0.75 if len(word) > 4 else 0.6  # of three letters a wrong one leaves 0.67
     word = word.lower().replace("-", "_")
-    without_unit = [each for each in flat if each.startswith(f"{word}_")]  # speed of speed_mps
-    close = difflib.get_close_matches(word, flat, 1, cutoff) or without_unit
-    return flat[close[0]] if close else ""
+    without_unit = [spelling for spelling in by_spelling if spelling.startswith(f"{word}_")]  # speed of speed_mps
+    close = difflib.get_close_matches(word, by_spelling, 1, cutoff) or without_unit
+    return by_spelling[close[0]] if close else ""
 
 
 def listed(names: Iterable[str]) -> str:
-    """Names in a message."""
+    """Names, separated by commas."""
     return ", ".join(names) or "none"
 
 
 def file_meant(file: Path) -> str:
-    """The same of the files beside one that is not there, by their names without the suffix."""
-    beside = sorted(each.name for each in file.parent.glob(f"*{file.suffix}") if each.is_file())
+    """`did_you_mean` for a file that is not there, of those of the same suffix beside it."""
+    beside = sorted(path.name for path in file.parent.glob(f"*{file.suffix}") if path.is_file())
     meant = did_you_mean(file.stem, [Path(name).stem for name in beside])
     return meant.replace("'?", f"{file.suffix}'?")
 

@@ -1,7 +1,7 @@
 """Work beside the main thread: worker processes, threads, and how all of them end.
 
-Workers are copies that `multiprocessing`'s fork server makes of itself, with all that takes long imported. Each leads a
-session of its own, so that a terminal's signals do not reach it and everything that it starts ends with it. It ends
+Workers are copies that `multiprocessing`'s fork server makes of itself, after it has imported all slow modules. Each
+leads a session of its own: a terminal's signals do not reach it, and everything that it starts ends with it. It ends
 when its parent does, however that ends.
 """
 
@@ -44,7 +44,7 @@ CLOSED_PIPE_EXIT_CODE = 76
 """Exit code of a process whose controller has closed its pipe."""
 _ATTEMPTS = 3
 _LOOK_S, _DYING_S = 0.5, 1.0
-"""Time between two looks, and how long a process may take to end once its pipe has."""
+"""Time between two looks, and how long a process may take to end after its pipe has been closed."""
 _PRELOADED = "harness.runner.preloaded"
 SAFE_PATH = "PYTHONSAFEPATH"
 
@@ -73,13 +73,13 @@ class SharedFile:
 
 
 class Began(NamedTuple):
-    """A word that a process may send before it answers: of the test that it has begun."""
+    """A message that a process may send before its answer: the test that it has begun."""
 
     episode: int
 
 
 class WorkerDeath(NamedTuple):
-    """How a process died: after which test that it had `Began`, if any; no ``exit_code`` if its machine was lost."""
+    """How a process died, and the test that it had begun, if any; no ``exit_code`` if its machine was lost."""
 
     exit_code: int | None
     episode: int | None
@@ -88,8 +88,8 @@ class WorkerDeath(NamedTuple):
 class Child:
     """A process that calls ``target(connection, *arguments)``, at the other end of a pipe, where it may `tell`.
 
-    It finds modules where this one does, and runs no script again. What it prints is no result (see `Printed`): stdout
-    is for the harness's.
+    It finds modules where this one does, and does not run the main script again. What it prints does not go to stdout,
+    which is for results (see `Printed`).
     """
 
     def __init__(self, target: Callable[..., None], *arguments: Any) -> None:
@@ -114,11 +114,11 @@ class Child:
 
     @property
     def handles(self) -> tuple[Connection, int]:
-        """What there is to wait for: that it sends something, or dies."""
+        """What to wait for: the process sends something, or dies."""
         return self.connection, self._process.sentinel
 
     def hears(self) -> bool:
-        """Whether there is an `answer` now; receives one word, which may not be it."""
+        """Receive one message, and say whether it was the `answer`."""
         try:
             word = self.connection.recv() if self.connection.poll() else WorkerDeath(self._died(), self._episode)
         except (EOFError, OSError, pickle.UnpicklingError):  # a vehicle may have spoilt what its process sends
@@ -143,12 +143,12 @@ class Child:
         return self._process.exitcode
 
     def wait(self, seconds: float) -> None:
-        """Give it a little time to end by itself; then end it."""
+        """Give it some ``seconds`` to end by itself; then end it."""
         self._process.join(seconds)
         self.kill()
 
     def _died(self) -> int | None:
-        """Exit code of one that has ended its pipe; if it lives on without it, it is ended."""
+        """Exit code of a process that has closed its pipe; ends it if it lives on."""
         self._process.join(_DYING_S)
         lives, exit_code = self._process.is_alive(), self.kill()
         return CLOSED_PIPE_EXIT_CODE if lives else exit_code
@@ -167,7 +167,7 @@ def first_to_answer(children: Sequence[_Child]) -> _Child:
 
 
 def tell(connection: Connection, work: Callable[[], Any]) -> None:
-    """Send what some work comes to, or its error; ends the process if nobody can hear it."""
+    """Send the result of some work, or its error; ends the process if nobody receives it."""
     try:
         answer = work()
     except Exception as error:  # noqa: BLE001 - whatever goes wrong here is the parent's to judge
@@ -190,14 +190,14 @@ def fit_to_travel(error: Exception) -> Exception:
 
 
 def start_server() -> None:
-    """Let the process that workers are copies of import what they need, beside this one."""
+    """Start the fork server, which imports what workers need while this process goes on."""
     with _server():
         forkserver.ensure_running()
 
 
 @contextmanager
 def _server() -> Iterator[None]:
-    """The fork server as workers need it: nobody's main script runs again, neither there nor in them."""
+    """Set up this process for starting the fork server or a worker: neither is to run the main script again."""
     try:
         os.chdir(os.getcwd())  # noqa: PTH109 - as workers will
     except OSError:  # a folder that is gone, maybe a vehicle's doing, or one that this user may not go to
@@ -207,14 +207,14 @@ def _server() -> Iterator[None]:
     main, sys.modules["__main__"] = sys.modules["__main__"], ModuleType("__main__")
     before, tempfile.tempdir = tempfile.tempdir, short
     masked = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # it would end with a traceback
-    kept = {name: os.environ.pop(name) for name in (SAFE_PATH, "PYTHONHASHSEED") if name in os.environ}
+    removed = {name: os.environ.pop(name) for name in (SAFE_PATH, "PYTHONHASHSEED") if name in os.environ}
     os.environ[SAFE_PATH] = "1"  # a json.py of the current folder is not what the server imports
     try:
         yield
     finally:
         sys.modules["__main__"], tempfile.tempdir = main, before
         os.environ.pop(SAFE_PATH)
-        os.environ |= kept
+        os.environ |= removed
         signal.pthread_sigmask(signal.SIG_SETMASK, masked)
 
 
@@ -270,29 +270,25 @@ def _end_with_parent() -> None:
 
 
 def _end_started_by(leader: int | None) -> None:
-    """End the processes of a session, and all below them, but for its leader; none on systems other than Linux."""
-    found = {leader}
-    for pid in sorted(int(each.name) for each in Path("/proc").glob("[0-9]*")):  # parents first
+    """End the processes of a session and their children, except its ``leader``; on Linux alone."""
+    ended = {leader}
+    for pid in sorted(int(folder.name) for folder in Path("/proc").glob("[0-9]*")):  # parents first
         with suppress(OSError):
-            fields = _stat(pid)
-            if found & {int(fields[1]), int(fields[3])} and pid != leader:
-                found.add(pid)
+            stat = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8")
+            _state, parent, _group, session, *_ = stat.rpartition(")")[2].split()
+            if ended & {int(parent), int(session)} and pid != leader:
+                ended.add(pid)
                 os.kill(pid, signal.SIGKILL)
 
 
-def _stat(pid: int | None) -> list[str]:
-    """Of a process: its state, its parent, its group, its session and more."""
-    return Path(f"/proc/{pid}/stat").read_text(encoding="utf-8").rpartition(")")[2].split()
-
-
 def end(process: subprocess.Popen[bytes]) -> int:
-    """End a process that leads a group, with that; returns its exit code."""
+    """End a process and the group that it leads; returns its exit code."""
     with suppress(ProcessLookupError, PermissionError):  # there is nobody left
         os.killpg(process.pid, signal.SIGKILL)
     return process.wait()
 
 
-# -- threads: what is done, and in which order, is the same as without them, so every bit is --
+# -- threads: the same work in the same order as without them, so that all bits are equal --
 
 
 _CONTROL_GROUPS, _OWN_GROUPS = Path("/sys/fs/cgroup"), Path("/proc/self/cgroup")
@@ -300,7 +296,7 @@ _CONTROL_GROUPS, _OWN_GROUPS = Path("/sys/fs/cgroup"), Path("/proc/self/cgroup")
 
 @cache
 def usable_cpus() -> int:
-    """CPUs that this process may use: its affinity allows so many, and the quota of its control groups, rounded up."""
+    """CPUs that this process may use, by its affinity and by the quotas of its control groups, rounded up."""
     return max(1, math.ceil(min([len(os.sched_getaffinity(0)), *_quotas()])))
 
 
@@ -342,7 +338,7 @@ def side_by_side(
 def made_ahead(
     make: Callable[[_Item], _Result], items: Iterable[_Item], n_threads: int | None = None
 ) -> Iterator[_Result]:
-    """What is made of each item, in order; ``n_threads`` (one per CPU) make the next while one is in use."""
+    """Results of ``make`` in order; ``n_threads`` (one per CPU) make the next ones while one is in use."""
     n_threads = n_threads or usable_cpus()
     with ThreadPoolExecutor(n_threads, thread_name_prefix="made-ahead") as threads:
         coming: deque[Future[_Result]] = deque()

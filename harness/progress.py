@@ -19,13 +19,13 @@ _SIGNS = {"rhw": "±", "asked": "asked ±"}
 
 
 class Progress:
-    """What the runner tells about its work; shown to nobody, as for the Python API. Nothing here changes a result.
+    """Reports of the runner about its work; this class shows nothing, as for the Python API. No result depends on it.
 
-    Who sets ``cancelled`` ends work in another thread the next time that it reports something.
+    Setting ``cancelled`` ends the work of another thread when it next reports something.
     """
 
     cancelled, remark = False, ""
-    """``remark`` is said behind the names of stages to come."""
+    """``remark`` is added to the names of later stages."""
 
     def stage(self, name: str, total: int | None, *, done: int = 0) -> None:
         """Begin a stage of ``total`` units (None: not known), ``done`` of which were finished by an earlier run."""
@@ -46,7 +46,7 @@ class Progress:
 
 
 class ShownProgress(Progress):
-    """One bar on a terminal; elsewhere, for logs, a line every ``interval_s``: nothing of work that takes less.
+    """One bar on a terminal; elsewhere, for logs, a line every ``interval_s``, and none for shorter work.
 
     The stream is stderr by default, since stdout is for results.
     """
@@ -78,10 +78,10 @@ class ShownProgress(Progress):
             self._bars.stop()
 
     def stage(self, name: str, total: int | None, *, done: int = 0) -> None:
-        """Begin a bar in the place of the last one; a log that has had a line is told at once, as of what is done."""
+        """Begin a bar in place of the last one; a log gets a line at once if it has one already, or if some is done."""
         name += self.remark + (f" ({count(done)} kept)" if done else "")
         if total is None and [name] == [task.description for task in self._bars.tasks]:
-            return  # it goes on, as of the next scenario
+            return  # the same stage, of the next scenario
         for task_id in self._bars.task_ids:
             self._bars.remove_task(task_id)
         self._bars.add_task(name, total=total, completed=done, before=done, figures={}, words="")
@@ -112,18 +112,18 @@ class ShownProgress(Progress):
             print(line, file=self._stream, flush=True)
 
     def lines(self) -> Iterator[str]:
-        """What a log is told now, with the time of day: nothing until a stage begins."""
+        """Lines for a log, with the time of day; none until a stage begins."""
         for task in self._bars.tasks:
-            of = f" of {count(task.total)}" if task.total is not None else ""
+            of_total = f" of {count(task.total)}" if task.total is not None else ""
             so_far = task.completed if task.total is None else min(task.completed, task.total)  # rounds may go beyond
-            told = " · ".join(filter(None, (f"{count(so_far)}{of}" if so_far else "", _words(task))))
-            yield f"{time.strftime('%H:%M:%S')} {task.description}: {told}".rstrip(" :")
+            text = " · ".join(filter(None, (f"{count(so_far)}{of_total}" if so_far else "", _words(task))))
+            yield f"{time.strftime('%H:%M:%S')} {task.description}: {text}".rstrip(" :")
 
 
 def _words(task: Task) -> str:
-    """Rate, figures, and time left, of what this run itself has done: an earlier run's share took no time now.
+    """Rate, figures, and time left, by the work of this run alone, without what an earlier run had done.
 
-    Shares of the rate (half-widths) that are no smaller than it say nothing yet.
+    A relative half-width of 1 or more is left out: it says nothing yet.
     """
     figures = [
         f"{_SIGNS[name]} {share(figure)}" if name in _SIGNS else f"{name.replace('_', ' ')} {words(figure, 2)}"

@@ -84,7 +84,7 @@ def require_ready(campaign: Campaign, command: Command = "run") -> Resolved:
         require_private(campaign.av.traci)
     script = script_step_s(campaign.av)
     resolved = replace(resolve(campaign, command), controller_sha256=controller_sha256, script=script)
-    accumulator(headline_of(campaign))  # one of the user's own can be made
+    accumulator(headline_of(campaign))  # fails if an estimator of the user's own cannot be made
     if campaign.sampling.strata:
         library, accept = resolved.library, campaign.accept  # the file is read, and refused if it is wrong
         if accept is not None and accept.times_reference is not None:

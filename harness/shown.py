@@ -1,4 +1,4 @@
-"""Results as Python shows them: a short answer, in a notebook with what there is to see below it."""
+"""Results as Python shows them: a short answer in lines, and in a notebook a plot below it."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ from harness.report.drawing import Plot, shown_with
 
 
 class ShownInPython:
-    """Something that is shown as lines of text, of which there are some ten, and maybe a plot."""
+    """A result that is shown as some ten lines of text, and maybe a plot."""
 
     @abstractmethod
     def _lines(self) -> Iterable[str]:
         """The text."""
 
     def _plot(self) -> Plot | None:
-        """What a notebook shows below."""
+        """The plot that a notebook shows below the text."""
         return None
 
     def __repr__(self) -> str:

@@ -23,7 +23,7 @@ _LEFT_TO_US = (signal.SIG_DFL, signal.default_int_handler)
 
 
 class Interruption:
-    """Which signal has asked for the end, if one has: as Ctrl-C does, so that every ``finally`` does its work."""
+    """The signal that has asked for the end, if any; it raises KeyboardInterrupt, so that every ``finally`` runs."""
 
     signal: signal.Signals | None = None
 
@@ -33,9 +33,9 @@ class Interruption:
         return 128 + (self.signal or signal.SIGINT)
 
     def arrive(self, number: int, _frame: FrameType | None) -> None:
-        """Handle the signal: only Ctrl-C may ask again, for somebody who cannot wait until all is tidied up."""
-        for other in (signal.SIGTERM, signal.SIGHUP):
-            signal.signal(other, signal.SIG_IGN)
+        """Handle the signal. A second Ctrl-C interrupts what is tidied up; other signals are ignored from now on."""
+        for further in (signal.SIGTERM, signal.SIGHUP):
+            signal.signal(further, signal.SIG_IGN)
         signal.signal(signal.SIGINT, signal.default_int_handler)
         self.signal = signal.Signals(number)
         Progress.cancelled = True  # a library may lose what is raised here: then the next report raises it again
@@ -44,7 +44,7 @@ class Interruption:
 
 @contextmanager
 def handlers_restored() -> Iterator[dict[signal.Signals, Any]]:
-    """Put back, afterwards, the handlers of `FROM_USER` that are there before: none where no thread may set them."""
+    """Restore the handlers of `FROM_USER` afterwards; yields them, or none outside of the main thread."""
     may_set = threading.current_thread() is threading.main_thread()
     before = {number: signal.getsignal(number) for number in FROM_USER if may_set}
     try:
@@ -56,7 +56,7 @@ def handlers_restored() -> Iterator[dict[signal.Signals, Any]]:
 
 @contextmanager
 def uninterrupted() -> Iterator[None]:
-    """Let what is inside come to its end before a signal interrupts: files, and who knows of them, belong together."""
+    """Delay signals until the block has ended: a file and the record of it are to be written together."""
     came: list[tuple[int, FrameType | None]] = []
     with handlers_restored() as before:
         for number, handler in before.items():
@@ -82,7 +82,7 @@ def interruptible() -> Iterator[Interruption]:
 
 
 def open_streams() -> None:
-    """Open what the shell has closed of the three standard streams: else a file or a pipe would take its number."""
+    """Open those of the three standard streams that the shell has closed: else a file would take their numbers."""
     while (descriptor := os.open(os.devnull, os.O_RDWR)) <= 2:
         pass
     os.close(descriptor)

@@ -1,6 +1,6 @@
-"""What a pool of events says in numbers: strata of known probability, and surrogates of known crash rate.
+"""Numbers of a pool: strata of known probability, and surrogates of known crash rate.
 
-The pool makes both; estimators and the planner of a campaign use them, and need nothing else of a pool.
+Estimators and the planner of a campaign use these, and need nothing else of a pool.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from harness.vocabulary import BoolArray, FloatArray, IntArray
 OUTSIDE = "outside"
 """Name of the stratum of everything beyond the boundary."""
 ASSUMPTION_FREE, LIBRARY_STATEMENT = "assumption_free", "library"
-"""What is asked about: the rate without an assumption, or that of a vehicle that crashes only inside the boundary."""
+"""Statements: the rate without an assumption, or that of a vehicle that crashes only inside the boundary."""
 FAILED_BASELINE = "failed shadow runs"
 """Name of a stratum that cannot be tested: events on paths on which the vehicle failed before one could come."""
 
@@ -33,7 +33,7 @@ Numbers = Annotated[
 
 
 def weight_of_a_test(p: FloatArray, tests: IntArray) -> FloatArray:
-    """What one test of each stratum stands for, p_s/n_s, shape (S,): crashes count so much in the rate.
+    """Weight of a test in the rate by its stratum, p_s/n_s, shape (S,).
 
     A stratum without a test counts as one with a single test, which has not crashed.
     """
@@ -55,10 +55,11 @@ class Reference:
 
 @dataclass(frozen=True)
 class Assumed:
-    """What data leave open of who cuts in closely, and by what it moves the probabilities of strata.
+    """A number of the traffic that data leave open, of close cut-ins, and how it moves the probabilities of strata.
 
-    It is the ``share`` of those who do not look, stated up to ``highest``; or lane changes at the times to collision
-    ``where`` none was seen. ``times`` are the factors at both ends, (2, S); None where no strata are known.
+    Either the ``share`` of drivers who do not look, stated up to ``highest``; or the rate of lane changes at times to
+    collision ``where`` none was seen. ``times`` (2, S) are factors of the probabilities at the two ends of what it may
+    be; None where no strata are known.
     """
 
     where: str = ""

@@ -1,4 +1,4 @@
-"""Campaigns: check, run and compare them, look at their vehicle and their pool."""
+"""Commands that take a campaign: check, run and compare it, check its vehicle, show its pool."""
 
 from __future__ import annotations
 
@@ -48,9 +48,10 @@ def check(
         print_json(campaign.model_dump(mode="json"))
     else:
         folder = campaign_file.parent if names_a_campaign(campaign_file) else Path()
-        text, here = dump_campaign(campaign), f"{real_path(folder)}/"
-        # It is written there, and may move; a vehicle's own parameter is nobody's to resolve.
-        click.echo(text if here in repr(campaign.av.parameters) else text.replace(here, ""))
+        text = dump_campaign(campaign)
+        prefix = f"{real_path(folder)}/"
+        # Paths are made relative again, as the file may move; but not where a vehicle's own parameter holds one.
+        click.echo(text if prefix in repr(campaign.av.parameters) else text.replace(prefix, ""))
 
 
 @click.command(
@@ -116,17 +117,13 @@ def run(
     Exit code 4: stop.episodes or the pool was used up before stop.rhw was reached or --accept decided; the results are
     written all the same. With --accept, 0 means accepted and 5 rejected.
     """
-    limit = [] if accept is None else options.accepting(accept)
-    where = [] if executor is None else [f"run.executor={executor}"]
-    seeds = [] if independent is None else [f"seed={independent}", f"pool.seed={independent}"]
-    given = [
-        *options.of_scenario(scenario),
-        *(f"exposure.{name}={value!r}" for name, value in exposures.items()),
-        *seeds,
-        *overrides,
-    ]
+    settings = [*options.of_scenario(scenario), *(f"exposure.{name}={n!r}" for name, n in exposures.items())]
+    settings += [] if independent is None else [f"seed={independent}", f"pool.seed={independent}"]
+    settings += overrides
+    settings += [] if accept is None else options.accepting(accept)
+    settings += [] if executor is None else [f"run.executor={executor}"]
     with error_in(junit, str(campaign_file)):
-        campaign = harness.load_campaign(campaign_file, [*given, *limit, *where], av=av)
+        campaign = harness.load_campaign(campaign_file, settings, av=av)
     if junit is not None and campaign.accept is None:
         say("note: without a limit (--accept) the JUnit file says only whether the run reached its end", err=True)
     folder = folder or options.run_folder(campaign, resume=resume)
@@ -213,15 +210,15 @@ def compare(
         read_manifest(stored)
     file_a = source_a if stored is None else stored / "campaign.yaml"
     overrides = [*options.of_scenario(scenario), *overrides]
-    of_b = file_b or file_a
-    with error_in(junit, f"{source_a} and {of_b}"):
+    source_b = file_b or file_a
+    with error_in(junit, f"{source_a} and {source_b}"):
         a = harness.load_campaign(file_a, overrides, av=av)
-        if names_a_campaign(file_a) and not names_a_campaign(of_b):  # a vehicle, driven as A's campaign says
-            b = harness.load_campaign(file_a, [*overrides, *against], av=str(of_b))
-            b = b.model_copy(update={"name": harness.load_campaign(of_b).name})
+        if names_a_campaign(file_a) and not names_a_campaign(source_b):  # a vehicle, driven as A's campaign says
+            b = harness.load_campaign(file_a, [*overrides, *against], av=str(source_b))
+            b = b.model_copy(update={"name": harness.load_campaign(source_b).name})
         else:
-            b = harness.load_campaign(of_b, [*overrides, *against], av=av)
-    if stored is not None:  # how far it was run before says nothing about now
+            b = harness.load_campaign(source_b, [*overrides, *against], av=av)
+    if stored is not None:  # the precision of the stored run is not what is asked for now
         a = a.model_copy(update={"stop": b.stop})
     (vehicle_a, _), (vehicle_b, _) = vehicle_words(a.av), vehicle_words(b.av)
     name_b = ", ".join(against) if file_b is None else b.name
@@ -237,16 +234,16 @@ def compare(
         folder = options.RUNS / f"{a.name}-{re.sub('[^A-Za-z0-9_.-]+', '-', name_b)}"
     rhw = a.stop.rhw if any(parse_override(each).path == ("stop", "rhw") for each in overrides) else None
     with error_in(junit, " and ".join(labels)), prints_kept_in(folder), progress_bar() as bar:
-        found = harness.compare(
+        comparison = harness.compare(
             a, b, folder, workers=workers, progress=bar, labels=labels, stored=stored, margin=margin, rhw=rhw
         )
     if junit is not None:
         from harness.report.junit import difference_case, write_junit
 
-        case = difference_case(found.content, repr(found), found.exit_code)
-        write_junit(junit, " and ".join(labels), case, [found.report, folder / "compare.json"])
-    print_either(found.content, [found], as_json=as_json)
-    ctx.exit(found.exit_code)
+        case = difference_case(comparison.content, repr(comparison), comparison.exit_code)
+        write_junit(junit, " and ".join(labels), case, [comparison.report, folder / "compare.json"])
+    print_either(comparison.content, [comparison], as_json=as_json)
+    ctx.exit(comparison.exit_code)
 
 
 @click.command(
@@ -283,13 +280,13 @@ def av_check(
     from harness.runner.look import check_av
 
     with prints_kept_in():
-        found = run_apart(campaign.av, check_av, campaign, episodes)
+        result = run_apart(campaign.av, check_av, campaign, episodes)
     if as_json:
-        print_json(found.to_json())
+        print_json(result.to_json())
     else:
-        say(*textwrap.wrap(verdict(found), 100, break_on_hyphens=False))
-        print_table("Vehicle under test", rows(found))
-    ctx.exit(found.exit_code)
+        say(*textwrap.wrap(verdict(result), 100, break_on_hyphens=False))
+        print_table("Vehicle under test", rows(result))
+    ctx.exit(result.exit_code)
 
 
 @click.command(

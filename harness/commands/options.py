@@ -28,13 +28,14 @@ RUNS = Path("runs")
 
 
 def written_file(*suffixes: str) -> Callable[[click.Context, click.Parameter, Path | None], Path | None]:
-    """Callback of an option that names a file to write: it ends in one of ``suffixes``, its folder may be made."""
+    """Callback of an option that names a file to write: it ends in one of ``suffixes``, and its folder can be made."""
 
     def checked(_ctx: click.Context, parameter: click.Parameter, value: Path | None) -> Path | None:
         if value is None:
             return None
         if value.suffix not in suffixes:
-            option, found = parameter.opts[0], f"a name that ends in '{value.suffix}'"
+            option = parameter.opts[0]
+            found = f"a name that ends in '{value.suffix}'"
             mend = f"Write {option} {value.parent / (value.stem or 'mine')}{suffixes[0]}."
             raise HarnessError(f"{option} {value}", found, f"a name that ends in {' or '.join(suffixes)}", mend)
         from harness.records.folder import require_place
@@ -46,7 +47,7 @@ def written_file(*suffixes: str) -> Callable[[click.Context, click.Parameter, Pa
 
 
 def _junit_file(ctx: click.Context, parameter: click.Parameter, value: Path | None) -> Path | None:
-    """Where the verdict goes; an earlier one does not outlive a run that comes to none."""
+    """File of the verdict; an earlier one is removed, so that a run without a verdict leaves none."""
     path = written_file(".xml")(ctx, parameter, value)
     if path is not None and path.is_file():
         path.unlink()
@@ -78,16 +79,16 @@ def _exposures(ctx: click.Context, parameter: click.Parameter, texts: tuple[str,
     from harness.campaign.sections import EXPOSURES
     from harness.families import family_named
 
-    found = {}
+    per_hour = {}
     for text in texts:
         name, _, value = text.partition("=")
         family_named(name, where := f"--exposure {text}")
         try:
-            found[name] = click.FloatRange(*EXPOSURES)(value, parameter, ctx)
+            per_hour[name] = click.FloatRange(*EXPOSURES)(value, parameter, ctx)
         except click.BadParameter as error:
             expected = "events per hour of driving, {:g} to {:g}".format(*EXPOSURES)
             raise HarnessError(where, error.message, expected, f"Write --exposure {name}=0.1, one each.") from None
-    return found
+    return per_hour
 
 
 exposure_option = click.option(
@@ -107,7 +108,7 @@ quiet_option = click.option(
 
 
 def of_scenario(text: str | None) -> list[str]:
-    """What ``--scenario`` sets."""
+    """Settings that ``--scenario`` stands for."""
     from harness.families import R157, family_named
 
     if text is None:
@@ -121,7 +122,7 @@ def of_scenario(text: str | None) -> list[str]:
 
 
 def progress_bar() -> Progress:
-    """What a command shows of its work, unless it is to be quiet."""
+    """Progress of a command, which shows nothing with ``--quiet``."""
     from harness.progress import Progress, ShownProgress
 
     return Progress() if click.get_current_context().meta.get("quiet") else ShownProgress()
@@ -135,7 +136,7 @@ json_option = click.option("--json", "as_json", is_flag=True, help="Print JSON o
 
 
 def campaign_options(command: Callable[..., None]) -> Callable[..., None]:
-    """Options of a command that takes a campaign or a vehicle: what is changed of it, and how the answer is printed."""
+    """Add the options of a command that takes a campaign or a vehicle: changes of it, and ``--json``."""
     for option in (json_option, set_option, av_option, scenario_option):
         command = option(command)
     return command
@@ -147,7 +148,7 @@ def examples(*lines: str) -> str:
 
 
 def accepting(limit: str) -> list[str]:
-    """What ``--accept`` sets: crashes per test, or a reference driver by its name, as in 0.5*r157-cc."""
+    """Settings that ``--accept`` stands for: crashes per test, or those of a driver by its name, as in 0.5*r157-cc."""
     try:
         keys, value = ("crash_rate_below", "times_reference"), f"{float(limit)!r}"
     except ValueError:
@@ -160,9 +161,9 @@ def accepting(limit: str) -> list[str]:
 
 
 def run_folder(campaign: Campaign, *, resume: bool) -> Path:
-    """``runs/NAME``, or the first new ``runs/NAME-2``, ``-3``, …; to resume, the last that is there."""
+    """``runs/NAME``, or the first of ``runs/NAME-2``, ``-3``, … that is free; to resume, the last that exists."""
     numbered = chain([RUNS / campaign.name], (RUNS / f"{campaign.name}-{number}" for number in count(2)))
-    there = list(takewhile(Path.exists, numbered))
-    if resume and there:
-        return there[-1]
-    return RUNS / (f"{campaign.name}-{len(there) + 1}" if there else campaign.name)
+    existing = list(takewhile(Path.exists, numbered))
+    if resume and existing:
+        return existing[-1]
+    return RUNS / (f"{campaign.name}-{len(existing) + 1}" if existing else campaign.name)

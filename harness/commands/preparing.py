@@ -1,4 +1,4 @@
-"""What is done once, before campaigns: set up the machine, get the schema for an editor, fit traffic of one's own."""
+"""Commands for what is done once: set up the machine, get the schema for an editor, fit traffic of one's own."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ from harness.vocabulary import MOST_ASKED
 @click.option("--seed", type=click.IntRange(min=0), default=1, show_default=True, help="Seed of the replicates.")
 @click.option("--force", is_flag=True, help="Write over files that no fit has written.")
 @json_option
-def fit(files: Sequence[Path], out: Path, *, replicates: int, as_json: bool, **given: Any) -> None:
+def fit(files: Sequence[Path], out: Path, *, replicates: int, as_json: bool, **options: Any) -> None:
     """Fit the traffic's laws to trajectories in CSV or Parquet FILEs, and write an environment file.
 
     One row per vehicle and time, 10 Hz or more: vehicle_id, time_s, s_m (centre, along the road), speed_mps, lane (0 =
@@ -49,13 +49,13 @@ def fit(files: Sequence[Path], out: Path, *, replicates: int, as_json: bool, **g
     computes how uncertain the rate is; and FILE.lead_brakes.yaml and FILE.cut_out.yaml, by what drivers met who follow.
     """
     with progress_bar() as bar:
-        found = harness.fit(files, out, n_replicates=replicates, progress=bar, **given)
-    written = repr(found).splitlines()
+        fitted = harness.fit(files, out, n_replicates=replicates, progress=bar, **options)
+    names = repr(fitted).splitlines()
     if as_json:
-        print_json({"files": written, **found.facts})
+        print_json({"files": names, **fitted.facts})
     else:
         setting = shlex.quote(f"environment.parameters={out}")
-        say(*found.told, *written, f"next: harness run my_av.py:MyAV --set {setting}")
+        say(*fitted.told, *names, f"next: harness run my_av.py:MyAV --set {setting}")
 
 
 @click.command(

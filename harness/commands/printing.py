@@ -1,4 +1,4 @@
-"""What the command line says: complaints on stderr; results on stdout, as JSON, sentences and tables."""
+"""What commands print: errors on stderr; results on stdout, as JSON, sentences and tables."""
 
 from __future__ import annotations
 
@@ -34,26 +34,27 @@ def say(*lines: object, err: bool = False) -> None:
 
 @contextmanager
 def prints_kept_in(folder: Path | None = None) -> Iterator[None]:
-    """Let what is printed in workers be a file of the run folder, and say so; to stderr where nothing was run there.
+    """Write what workers print to a file of the run folder, and name it; to stderr if nothing was run there.
 
-    Without a folder only how much it was is said.
+    Without a folder only the number of lines is given.
     """
-    began, before, Printed.kept = time.time(), Printed.kept, (kept := Kept())
+    began = time.time()
+    before, Printed.kept = Printed.kept, (kept := Kept())
     try:
         yield
     finally:
         Printed.kept = before
-        with suppress(OSError):  # what ends the command is told first of all
+        with suppress(OSError):  # the error that ends the command is more important
             manifests = () if folder is None else folder.rglob("manifest.json")
-            if folder is not None and not any(each.stat().st_mtime >= began for each in manifests):
+            if folder is not None and not any(manifest.stat().st_mtime >= began for manifest in manifests):
                 os.write(2, kept.text)
             elif first := kept.text.strip().partition(b"\n")[0].decode(errors="replace"):
-                told = f"{count(kept.n_lines)} lines printed by the vehicle (or SUMO)"
+                line = f"{count(kept.n_lines)} lines printed by the vehicle (or SUMO)"
                 if folder is not None:
                     with (folder / PRINTED).open("ab") as file:
                         file.write(kept.text)
-                    told += f": {folder / PRINTED}"
-                say(told, f"  the first: {first[:80]}", err=True)
+                    line += f": {folder / PRINTED}"
+                say(line, f"  the first: {first[:80]}", err=True)
 
 
 def go_on_unread(stream: TextIO) -> None:
@@ -68,14 +69,14 @@ def show_error(error: HarnessError) -> None:
         say(f" {error.where}: {error.found}", err=True)
     for part in error.problems or (error,):
         click.secho("error:", fg="red", bold=True, err=True, nl=False)
-        told = {"found:": part.found, "expected:": part.expected, "fix:": part.mend}
-        # ` is of commands in docs
-        say(f" {part.where}", *(f"  {name:<9} {text}".replace("`", "'") for name, text in told.items()), err=True)
+        parts = {"found:": part.found, "expected:": part.expected, "fix:": part.mend}
+        # In documents a command stands in backquotes, which a shell would run.
+        say(f" {part.where}", *(f"  {name:<9} {text}".replace("`", "'") for name, text in parts.items()), err=True)
 
 
 @contextmanager
 def error_in(junit: Path | None, suite: str) -> Iterator[None]:
-    """Write an error that comes to no verdict into the JUnit file, if one is asked for, as well."""
+    """Write an error, as there is no verdict then, also into the JUnit file, if one is asked for."""
     try:
         yield
     except HarnessError as error:
@@ -95,17 +96,17 @@ _HOW_TO_GO_ON = {
 
 def show_interrupted(command: str, signal_name: str | None) -> None:
     """Say that the user or the system asked for the end, and that nothing finished is lost."""
-    by = f" by {signal_name}" if signal_name not in (None, "SIGINT") else ""
+    sender = f" by {signal_name}" if signal_name not in (None, "SIGINT") else ""
     with suppress(OSError):  # after SIGHUP there may be no terminal left
-        click.echo(f"Interrupted{by}.{_HOW_TO_GO_ON.get(command, '')}", err=True)
+        click.echo(f"Interrupted{sender}.{_HOW_TO_GO_ON.get(command, '')}", err=True)
 
 
 def holds_tests(folder: Path) -> bool:
     """Whether a run has finished something in a folder, or in one below it."""
     with suppress(OSError, ValueError, KeyError, TypeError):
         manifests = [json.loads(path.read_bytes()) for path in folder.rglob("manifest.json")]
-        return any(each["n_episodes"] or each["before"] for each in manifests)
-    return True  # what is there cannot be read
+        return any(manifest["n_episodes"] or manifest["before"] for manifest in manifests)
+    return True  # something is there, if it cannot be read
 
 
 _OF_THE_SYSTEM = (
@@ -128,8 +129,9 @@ def system_error(error: OSError | MemoryError) -> HarnessError | None:
     if isinstance(error, MemoryError):
         mend = f"Use fewer --workers, or lift the limit (`ulimit -v`, or one that the vehicle has set). {_AGAIN}"
         return HarnessError("memory", "none left", "room for the tests of each worker", mend)
-    name, where = errno.errorcode.get(error.errno or 0), str(error.filename or "disk of the output folder")
-    if name == "ENOENT" and error.filename is None:  # so says os.getcwd
+    name = errno.errorcode.get(error.errno or 0)
+    where = str(error.filename or "disk of the output folder")
+    if name == "ENOENT" and error.filename is None:  # raised by os.getcwd
         return HarnessError("current folder", "that it has been removed", "a folder", "Go to one that is there (cd).")
     for names, found, expected, mend in _OF_THE_SYSTEM:
         if name in names:
@@ -140,10 +142,11 @@ def system_error(error: OSError | MemoryError) -> HarnessError | None:
 def usage_error(error: click.UsageError, context: click.Context) -> HarnessError:
     """Put what click says of a wrong call into the words of all errors."""
     usage = " ".join(context.get_usage().removeprefix("Usage: ").split())
-    mend, found = f"See `{context.command_path} --help`.", error.format_message().rstrip(".")
+    found = error.format_message().rstrip(".")
+    mend = f"See `{context.command_path} --help`."
     if isinstance(error, click.NoSuchOption):
         found = f"No such option '{error.option_name}'"
-        options = [option for each in context.command.params for option in each.opts if len(option) > 2]
+        options = [option for parameter in context.command.params for option in parameter.opts if len(option) > 2]
         longer = [option for option in options if error.option_name.startswith(option)]  # --output
         if not longer and (setting := _setting_of(error.option_name, context.command)):
             mend = f"Write --set {setting}=…"
@@ -153,14 +156,14 @@ def usage_error(error: click.UsageError, context: click.Context) -> HarnessError
 
 
 def _setting_of(option: str, command: click.Command) -> str:
-    """The campaign's key that an unknown option is called like; empty if there is none, or no ``--set``."""
+    """The campaign's key of the same name as an unknown option; empty if there is none, or no ``--set``."""
     from harness.campaign.campaign import Campaign
     from harness.campaign.models import places_of
 
     key = option.lstrip("-").replace("-", "_")
-    places = (f"{each}.{key}".lstrip(".") for each in places_of(key, Campaign))
-    takes_settings = any("--set" in each.opts for each in command.params)
-    return min(places, key=lambda at: at.count("."), default="") if takes_settings else ""
+    places = (f"{section}.{key}".lstrip(".") for section in places_of(key, Campaign))
+    takes_settings = any("--set" in parameter.opts for parameter in command.params)
+    return min(places, key=lambda place: place.count("."), default="") if takes_settings else ""
 
 
 def print_json(content: Any) -> None:
@@ -193,11 +196,11 @@ def print_table(title: str, rows: Sequence[Mapping[str, Any]]) -> None:
     console.print(table)
 
 
-def print_estimates(content: dict[str, Any], asked: Sequence[str]) -> None:
+def print_estimates(content: dict[str, Any], estimators: Sequence[str]) -> None:
     """Print the estimators of ``estimates.json`` that are asked for as a table, with warnings and reasons below."""
     from harness.report.notes import note_words
 
-    shown = {name: entry for name, entry in content["estimates"].items() if name in asked}
+    entries = {name: entry for name, entry in content["estimates"].items() if name in estimators}
     rows = [
         {
             "estimator": name + (" *" if name == content["headline"] else ""),
@@ -207,14 +210,14 @@ def print_estimates(content: dict[str, Any], asked: Sequence[str]) -> None:
             "effective crashes": entry.get("n_effective"),
             "largest weight share": share(entry.get("largest_weight_share")),
         }
-        for name, entry in shown.items()
+        for name, entry in entries.items()
         if entry["crash_rate"] is not None  # else there is but a reason
     ]
     if rows:
         print_table(f"{content['campaign']}: {content['n_crashes']:,} crashes in {content['n_episodes']:,} tests", rows)
-    for name, entry in shown.items():
+    for name, entry in entries.items():
         for remark in [*entry.get("warnings", ()), *filter(None, [entry.get("why")])]:
             say(f"{name}: {note_words(remark)}")
-    if shells := shown.get("shells", {}).get("details", {}).get("shells"):
+    if shells := entries.get("shells", {}).get("details", {}).get("shells"):
         names = ("shell", "inside", "p", "n_episodes", "n_crashes", "contribution")
         print_table("Shells, from careful to careless", [{name: shell[name] for name in names} for shell in shells])

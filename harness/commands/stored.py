@@ -84,9 +84,9 @@ def estimate(
     else:
         from harness.estimators.one_pass import asked_for
 
-        asked = asked_for(estimators, "--estimator")
-        estimators = list(map(str, asked))
-        content = harness.estimate(folder, estimators=asked or None, confidence=confidence)
+        loaded = asked_for(estimators, "--estimator")
+        estimators = list(map(str, loaded))
+        content = harness.estimate(folder, estimators=loaded or None, confidence=confidence)
     if write:
         write_sealed(folder / "estimates.json", content)
     if as_json:
@@ -119,7 +119,7 @@ def _estimate_hours(
 
 
 def _ranges(_ctx: click.Context, _parameter: click.Parameter, texts: tuple[str, ...]) -> dict[str, tuple[float, float]]:
-    found = {}
+    ranges = {}
     for text in texts:
         name, _, ends = text.partition("=")
         try:
@@ -127,8 +127,8 @@ def _ranges(_ctx: click.Context, _parameter: click.Parameter, texts: tuple[str, 
         except ValueError:
             mend = "Write --range cut_in.ignore_share=0.001:0.08."
             raise HarnessError(f"--range {text}", "no two numbers", "SECTION.NAME=LOW:HIGH", mend) from None
-        found[name] = low, high
-    return found
+        ranges[name] = low, high
+    return ranges
 
 
 @click.command(
@@ -184,13 +184,13 @@ def sensitivity(folder: Path, *, ranges: dict[str, tuple[float, float]], as_json
 def _bar(bar: dict[str, Any]) -> dict[str, str]:
     from harness.report.rows import bar_note
 
-    def ends(of: list[float | None]) -> str:
-        return "× " + " … ".join(number(end, 3) for end in of)
+    def ends(factors: list[float | None]) -> str:
+        return "× " + " … ".join(number(end, 3) for end in factors)
 
     values = "" if bar["values"] is None else " … ".join(map(plain, bar["values"]))
-    told = {"number": bar["what"], "known": f"{bar['known']} {values}", "rate": ends(bar["rate"])}
+    cells = {"number": bar["what"], "known": f"{bar['known']} {values}", "rate": ends(bar["rate"])}
     off = " … ".join(share(off, least=0.001) for off in bar["off"]) if bar["off"] != [None, None] else ""
-    return {**told, "ratio": ends(bar["ratio"]), "error": off, "remark": bar_note(bar)}
+    return {**cells, "ratio": ends(bar["ratio"]), "error": off, "remark": bar_note(bar)}
 
 
 @click.command(
@@ -262,7 +262,7 @@ def replay(
     for file in files:  # can be written, before anything is simulated for them
         writer_of(file)
         require_place(file.parent)
-    asked = folder
+    given_folder = folder
     folder, episode = hardest_crash(folder) if episode is None else (folder, episode)
     manifest = read_manifest(folder)
     campaign = read_campaign(folder, manifest, check_files=not stored)
@@ -270,13 +270,13 @@ def replay(
         say(f"The vehicle is {code}.", err=True)
     program = gui_program() if gui else None
     result = harness.replay(folder, episode, stored=stored, trust=trust)
-    written = [each for file in files for each in harness.write_motion(result, file)]
+    written = [path for file in files for path in harness.write_motion(result, file)]
     content = {"folder": str(folder), "episode": episode, "outcome": result.outcome, "bit_equal": result.bit_equal}
     content |= {"files": [str(file) for file in written]}
     compared = {None: "no stored motion to compare with", True: "bit for bit as stored", False: "NOT as stored"}
     words = "the motion that the run has kept" if stored else compared[result.bit_equal]
     head, *facts = repr(result).splitlines()
-    head = head if folder == asked else f"{folder}, {head}"
+    head = head if folder == given_folder else f"{folder}, {head}"
     print_either(content, [f"{head}; {words}", *facts, *written], as_json=as_json)
     if not stored and result.bit_equal is not False and (note := code_changed(manifest, campaign)):
         say(f"note: {note}", err=True)

@@ -1,4 +1,4 @@
-"""What a family says of itself to people: nouns and phrases, the axes of its maps, and who is driven beside the AV."""
+"""What a family says of itself to people: nouns and phrases, and the axes of its maps."""
 
 from __future__ import annotations
 
@@ -10,19 +10,19 @@ import numpy as np
 from harness.vocabulary import FloatArray
 
 EXCLUDED = "the fitted data exclude it"
-"""In the note of an exposure that was kept although too few events were counted for one."""
+"""Marks the note of an exposure that a fit has kept, although the few events that it counted exclude it."""
 
 
 class Words(NamedTuple):
     """Nouns and phrases of pages and terminals.
 
-    ``called`` is the scenario, ``test`` what a rate per test is of; ``event``, ``events`` what happens in it, ``since``
-    the moment that times are counted from. ``kicker`` says what pages are about, ``such`` what a rate per million km is
-    of, ``same`` what two vehicles meet alike, ``none`` that nothing happened, ``strikes`` what the AV does in a crash,
-    ``who`` the vehicles are, and ``unlikely`` why probabilities of events do not add up to 1. ``shows`` and ``happens``
-    are a vehicle each and what it does at the onset and at the event; the same where they are one. ``tests`` says of
-    which kind tests are, by whether events show themselves, and ``rests`` what a rate scales with, by the traffic (None
-    where it is not known) and the level of lane changing.
+    ``called`` names the scenario, ``test`` a test, ``event`` and ``events`` what happens in it, ``since`` the moment
+    from which times are counted, ``such`` the driving of a rate per million km, ``same`` events that two vehicles meet
+    alike. ``kicker`` says what pages are about, ``none`` that nothing happened, ``strikes`` what the AV does in a
+    crash, ``who`` the vehicles are, ``unlikely`` why probabilities of events do not add up to 1. ``shows`` and
+    ``happens`` are a vehicle and what it does, at the onset and at the event; equal where these are one. ``tests`` says
+    what tests are like, by whether events show themselves, and ``rests`` what a rate scales with, by the traffic (None
+    if it is not known) and the level of lane changing.
     """
 
     called: str
@@ -44,8 +44,8 @@ class Words(NamedTuple):
 
 
 def words_of(*, event: str, of: str, **own: Any) -> Words:
-    """What can be said of an event ``of`` a vehicle that has a name, and whatever a family has of its ``own``."""
-    said = {
+    """General words for an event ``of`` a vehicle; a family replaces some by its ``own``."""
+    defaults = {
         "called": event, "test": f"one {event}", "events": f"{event}s", "since": f"the {event}", "such": "",
         "same": f"{event}s",
         "kicker": f"How often an automated vehicle (AV) crashes when there is a {event}, on a motorway",
@@ -54,15 +54,15 @@ def words_of(*, event: str, of: str, **own: Any) -> Words:
         "tests": lambda _: f"a {event} on a straight road",
         "rests": lambda *_: f"the probabilities of {event}s, for which nothing else vouches",
     }  # fmt: skip
-    return Words(event=event, **{**said, **own})
+    return Words(event=event, **{**defaults, **own})
 
 
 class Shown(NamedTuple):
-    """A number of events that maps and tables show.
+    """A quantity of events that maps and tables show.
 
-    ``words``, ``unit`` name it on axes, ``head`` are the lines over a column. ``of`` makes it (n,) of columns of tests.
-    A map goes ``beyond`` times as far as nearly all crashes do; its cells are between ``edges`` where there are some
-    (E + 1,), as of numbers of a grid, and those of events compared are ``cell`` wide.
+    ``words``, ``unit`` name it on axes, ``head`` are the lines over a column. ``of`` computes it (n,) from columns of
+    tests. A map reaches ``beyond`` times as far as nearly all crashes. Its cells lie between ``edges`` (E + 1,), if the
+    quantity is on a grid; events are compared in cells ``cell`` wide.
     """
 
     words: str
@@ -75,12 +75,13 @@ class Shown(NamedTuple):
 
     @property
     def axis(self) -> str:
-        """What stands beside an axis."""
+        """Label of an axis."""
         return f"{self.words}, {self.unit}"
 
 
-GAP = Shown("gap at the event", "m", ("Gap at", "event"), lambda of: of["event_gap_m"], beyond=1.4, cell=1.0)
+GAP = Shown("gap at the event", "m", ("Gap at", "event"), lambda tests: tests["event_gap_m"], beyond=1.4, cell=1.0)
 CLOSING = Shown(
-    "closing speed", "m/s", ("Closing", "speed"), lambda of: np.asarray(-of["event_rate_mps"]), beyond=1.15, cell=0.5
-)
-"""To the vehicle that events are about, at the event: of any family."""
+    "closing speed", "m/s", ("Closing", "speed"), lambda tests: np.asarray(-tests["event_rate_mps"]), beyond=1.15,
+    cell=0.5,
+)  # fmt: skip
+"""Gap and closing speed to the vehicle that events are about, at the event: in any family."""

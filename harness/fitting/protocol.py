@@ -49,5 +49,5 @@ class Fitter(Protocol):
     def observe(self, recording: Recording) -> None:
         """Keep what it needs of a recording."""
 
-    def fitted(self, asked: FitRequest, others: Mapping[str, Fitted]) -> Fitted:
+    def fitted(self, request: FitRequest, others: Mapping[str, Fitted]) -> Fitted:
         """What was found, or a `TrajectoryError`; ``others`` are families that come after it, for its page."""

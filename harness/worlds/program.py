@@ -98,8 +98,8 @@ class BatchConnection(Connection):  # type: ignore[misc] # traci has no types
         if not names:
             return
         for name, speed in zip(map(str.encode, names), speeds, strict=True):
-            what = tc.CMD_SET_VEHICLE_VARIABLE, tc.VAR_SPEED, len(name), name, tc.TYPE_DOUBLE, speed
-            self._string += struct.pack(f"!BBBi{len(name)}sBd", 16 + len(name), *what)
+            fields = tc.CMD_SET_VEHICLE_VARIABLE, tc.VAR_SPEED, len(name), name, tc.TYPE_DOUBLE, speed
+            self._string += struct.pack(f"!BBBi{len(name)}sBd", 16 + len(name), *fields)
             self._queue.append(tc.CMD_SET_VEHICLE_VARIABLE)
         self._sendExact()
 
@@ -184,18 +184,18 @@ class ConnectedProgram:
         """Clients that SUMO has now; where the system has no table of connections, the program counts while it runs."""
         if not _TCP_TABLE.exists():
             return 2
-        here = f":{self._port:04X}"
+        port = f":{self._port:04X}"
         rows = (line.split() for line in _TCP_TABLE.read_text(encoding="ascii").splitlines()[1:])
-        clients = [row for row in rows if row[1].endswith(here) and row[3] == _ESTABLISHED]
-        for _, own, theirs, *_ in clients:
-            require_neighbour(own, theirs)
+        clients = [row for row in rows if row[1].endswith(port) and row[3] == _ESTABLISHED]
+        for _, server_end, client_end, *_ in clients:
+            require_neighbour(server_end, client_end)
         return len(clients)
 
     def _n_sockets(self) -> int:
         """Sockets that SUMO has open, one less when a client has left without a word; 0 where nobody says."""
         try:
-            with os.scandir(f"/proc/{self._server.pid}/fd") as found:
-                return sum(os.readlink(file).startswith("socket:") for file in found)  # noqa: PTH115 - once per step
+            with os.scandir(f"/proc/{self._server.pid}/fd") as descriptors:
+                return sum(os.readlink(each).startswith("socket:") for each in descriptors)  # noqa: PTH115 - every step
         except OSError:
             return 0
 
@@ -210,14 +210,16 @@ def _start_program(av: TraciProcess, port: int, n_cells: int) -> subprocess.Pope
         # What it prints belongs on the terminal, but stdout is for the harness's results.
         return subprocess.Popen(words, stdout=sys.stderr.fileno(), process_group=0)  # noqa: S603 - the user's own
     except (OSError, ValueError) as error:  # a null character in a word is a ValueError
-        found, mend = f"{av.command} ({error})", "Try it in a shell, in the folder in which you start the harness."
-        raise CampaignError("av.traci.command", found, "a program that can be started", mend) from error
+        mend = "Try it in a shell, in the folder in which you start the harness."
+        raise CampaignError(
+            "av.traci.command", f"{av.command} ({error})", "a program that can be started", mend
+        ) from error
 
 
-def require_neighbour(own: str, theirs: str) -> None:
-    """Refuse a client of another machine; both ends as the table of connections writes them (proc(5), net/tcp)."""
-    address = socket.inet_ntoa(int(theirs.partition(":")[0], 16).to_bytes(4, sys.byteorder))
-    if not address.startswith("127.") and own.partition(":")[0] != theirs.partition(":")[0]:
+def require_neighbour(server_end: str, client_end: str) -> None:
+    """Refuse a client of another machine; ``server_end`` and ``client_end`` are addresses as in /proc/net/tcp."""
+    address = socket.inet_ntoa(int(client_end.partition(":")[0], 16).to_bytes(4, sys.byteorder))
+    if not address.startswith("127.") and server_end.partition(":")[0] != client_end.partition(":")[0]:
         expected = "the program that av.traci.command starts, on this machine"
         mend = "Close this machine's ports to others, or let the program run here."
         raise WorldDisagreementError("SUMO's TraCI server", f"a client at {address}", expected, mend)
@@ -274,9 +276,9 @@ class TraciWorld(SumoCells):
             raise AVLostError(self._given_up or "the program is not running")
         return self._program
 
-    def _move(self, to: Any, k: int, vehicle: int, x: float, v: float, lane: int) -> None:
-        to.setSpeedMode(self._names[k][vehicle], OBEY)  # whatever the program has made of it
-        super()._move(to, k, vehicle, x, v, lane)
+    def _move(self, vehicle_api: Any, k: int, vehicle: int, x: float, v: float, lane: int) -> None:
+        vehicle_api.setSpeedMode(self._names[k][vehicle], OBEY)  # whatever the program has made of it
+        super()._move(vehicle_api, k, vehicle, x, v, lane)
 
     def place(self, cells: IntArray, x: FloatArray, v: FloatArray, lane: Int8Array) -> None:
         """Take the AVs of these cells back under command."""
@@ -313,37 +315,35 @@ class TraciWorld(SumoCells):
         self, api: BatchConnection, commanded: BoolArray, speed: FloatArray, lane: Int8Array
     ) -> list[tuple[str, int]]:
         changing = self._change_lanes(api.vehicle, lane)
-        told = np.flatnonzero(commanded)
-        api.set_speeds([self._flat[i] for i in told.tolist()], speed.ravel()[told].tolist())
+        places = np.flatnonzero(commanded)
+        api.set_speeds([self._flat[i] for i in places.tolist()], speed.ravel()[places].tolist())
         return changing
 
-    def _read(self, found: dict[str, Any], speed: FloatArray, commanded: BoolArray) -> None:
+    def _read(self, results: dict[str, Any], speed: FloatArray, commanded: BoolArray) -> None:
         """Compare what was commanded with where it is, and take over where the program's AVs are."""
         x, v = self.x.copy(), self.v.copy()
         advance(x, v, speed)
-        if gone := [name for name in self._flat if name not in found]:
-            raise _meddled(gone[0], "a vehicle that has left the road", "a vehicle that is there")
-        read = np.array([[found[name][variable] for variable in _SUBSCRIBED] for name in self._flat])
-        position, speed_read, lane = read.reshape(*self.x.shape, len(_SUBSCRIBED)).transpose(2, 0, 1)
-        for quantity, here, wanted in (("position, m", position, x), ("speed, m/s", speed_read, v)):
-            self._require(quantity, here, wanted, commanded)
+        if missing := [name for name in self._flat if name not in results]:
+            raise _meddled(missing[0], "a vehicle that has left the road", "a vehicle that is there")
+        values = np.array([[results[name][variable] for variable in _SUBSCRIBED] for name in self._flat])
+        position, speed_read, lane = values.reshape(*self.x.shape, len(_SUBSCRIBED)).transpose(2, 0, 1)
+        for quantity, actual, target in (("position, m", position, x), ("speed, m/s", speed_read, v)):
+            self._require(quantity, actual, target, commanded)
         self._require("lane", lane, self.lane, np.ones_like(commanded))
         change = np.where(commanded, 0.0, (speed_read - self.v) / STEP_S)[:, -1]
         least, most = self._limits.min_acceleration_mps2, self._limits.max_acceleration_mps2
         for k in np.flatnonzero((change < least - _ROUNDING_MPS2) | (change > most + _ROUNDING_MPS2)):
-            expected, mend = (
-                f"{least:g} to {most:g} m/s² (av.limits)",
-                "Command speeds that the vehicle can reach in 0.1 s.",
-            )
+            mend = "Command speeds that the vehicle can reach in 0.1 s."
+            expected = f"{least:g} to {most:g} m/s² (av.limits)"
             raise WorldDisagreementError(f"SUMO, {self._names[k][-1]}", f"{change[k]:.1f} m/s²", expected, mend)
         self.x[:], self.v[:] = position, speed_read
 
-    def _require(self, quantity: str, found: FloatArray, wanted: Any, which: BoolArray) -> None:
-        wrong = np.argwhere(which & (found != wanted))
+    def _require(self, quantity: str, actual: FloatArray, target: Any, which: BoolArray) -> None:
+        wrong = np.argwhere(which & (actual != target))
         if wrong.size:
             k, vehicle = wrong[0].tolist()
             where = f"{self._names[k][vehicle]}, {quantity}"
-            raise _meddled(where, repr(float(found[k, vehicle])), f"{float(wanted[k, vehicle])!r}, as commanded")
+            raise _meddled(where, repr(float(actual[k, vehicle])), f"{float(target[k, vehicle])!r}, as commanded")
 
     def restart(self) -> None:
         """Begin again; once the restarts are used up, all further episodes fail."""

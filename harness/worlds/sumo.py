@@ -1,10 +1,9 @@
-"""K cells in one libsumo simulation: told every speed, and every position compared with it after each step.
+"""K cells in one libsumo simulation: every speed is commanded, and every position compared after each step.
 
-SUMO keeps a speed that it has been told until the next command. A finished cell is refilled by moving its vehicles
-back: nothing is removed or added. After each step every position is read back and compared, bit for bit, with what was
-commanded, and every speed too: with the optional compiled shim (`shim.cpp`, built when the package is installed, where
-there is a C++ compiler) after each step, without it, or with ``HARNESS_SHIM=0``, after every tenth. A difference stops
-the run.
+SUMO keeps a commanded speed until the next command. A finished cell is refilled by moving its vehicles back: nothing is
+removed or added. After each step every position is read back and compared, bit for bit, with what was commanded. Speeds
+are compared after each step with the optional compiled shim (`shim.cpp`, built when the package is installed, where
+there is a C++ compiler); without it, or with ``HARNESS_SHIM=0``, after every tenth. A difference stops the run.
 """
 
 from __future__ import annotations
@@ -78,51 +77,53 @@ class SumoCells(World):
         self.lane[:], self.lane[:, -1] = LEFT, RIGHT
         for k, names in enumerate(self._names):
             api.route.add(f"cell{k}", [f"cell{k}"])
-            for vehicle, (name, at) in enumerate(zip(names, self._parked.tolist(), strict=True)):
+            for vehicle, (name, position) in enumerate(zip(names, self._parked.tolist(), strict=True)):
                 lane, kind = (RIGHT, self._av_type) if name is names[-1] else (LEFT, self._type)
-                api.vehicle.add(name, f"cell{k}", typeID=kind, departLane=str(lane), departPos=str(at))
+                api.vehicle.add(name, f"cell{k}", typeID=kind, departLane=str(lane), departPos=str(position))
                 api.vehicle.setSpeedMode(name, OBEY)
                 api.vehicle.setLaneChangeMode(name, 0)
-                self._move(api.vehicle, k, vehicle, at, 0.0, lane)
+                self._move(api.vehicle, k, vehicle, position, 0.0, lane)
         # A vehicle that is still pending after the first step ignores moveTo: all stand on the road before it.
         api.simulationStep()
 
-    def _put(self, to: Any, cells: IntArray, x: FloatArray, v: FloatArray, lane: Int8Array) -> None:
+    def _put(self, vehicle_api: Any, cells: IntArray, x: FloatArray, v: FloatArray, lane: Int8Array) -> None:
         """Move the vehicles of the given cells (n,) to ``x[cells]``, at ``v[cells]``, on ``lane[cells]``.
 
-        Who changes lanes for it comes last: SUMO does not sort its list of a lane again when a vehicle is moved within
-        it; one from another lane it puts at the right place. So of several that stay on a lane all but one go by the
-        other: when a test ended one may have run through another.
+        SUMO keeps a list of the vehicles on each lane. It does not sort it again when a vehicle is moved within its
+        lane, but puts one that comes from another lane at the right place. Vehicles may have changed their order (in a
+        crash one runs through another): so of several that stay on a lane, all but one are moved to the other lane
+        first, and those that change lanes are moved last.
         """
-        for k, at, driving in zip(cells.tolist(), x[cells].tolist(), v[cells].tolist(), strict=True):
-            changes, to_lane = (lane[k] != self.lane[k]).tolist(), lane[k].tolist()
+        for k, positions, speeds in zip(cells.tolist(), x[cells].tolist(), v[cells].tolist(), strict=True):
+            changes = (lane[k] != self.lane[k]).tolist()
+            to_lane = lane[k].tolist()
             stay: dict[int, int] = {}
-            for vehicle, on in enumerate(to_lane):
-                if not changes[vehicle] and stay.setdefault(on, vehicle) != vehicle:
-                    to.moveTo(self._names[k][vehicle], f"cell{k}_{1 - on}", at[vehicle])
+            for vehicle, on_lane in enumerate(to_lane):
+                if not changes[vehicle] and stay.setdefault(on_lane, vehicle) != vehicle:
+                    vehicle_api.moveTo(self._names[k][vehicle], f"cell{k}_{1 - on_lane}", positions[vehicle])
                     changes[vehicle] = True
             for vehicle in sorted(range(len(changes)), key=changes.__getitem__):
-                self._move(to, k, vehicle, at[vehicle], driving[vehicle], to_lane[vehicle])
+                self._move(vehicle_api, k, vehicle, positions[vehicle], speeds[vehicle], to_lane[vehicle])
         self.x[cells], self.v[cells], self.lane[cells] = x[cells], v[cells], lane[cells]
 
-    def _move(self, to: Any, k: int, vehicle: int, x: float, v: float, lane: int) -> None:
+    def _move(self, vehicle_api: Any, k: int, vehicle: int, x: float, v: float, lane: int) -> None:
         name = self._names[k][vehicle]
-        to.moveTo(name, f"cell{k}_{lane}", x)
-        to.setPreviousSpeed(name, v)
-        to.setSpeed(name, v)
+        vehicle_api.moveTo(name, f"cell{k}_{lane}", x)
+        vehicle_api.setPreviousSpeed(name, v)
+        vehicle_api.setSpeed(name, v)
 
-    def _change_lanes(self, to: Any, lane: Int8Array) -> list[tuple[str, int]]:
-        """Let those who change to other lanes (K, V) in this step do so: their names and lanes."""
+    def _change_lanes(self, vehicle_api: Any, lane: Int8Array) -> list[tuple[str, int]]:
+        """Command all changes to other lanes (K, V) in this step; returns the vehicles' names and their new lanes."""
         if lane.tobytes() == self.lane.tobytes():  # in most steps, and ten times faster to see
             return []
         changing = [(self._names[k][i], int(lane[k, i])) for k, i in np.argwhere(lane != self.lane).tolist()]
-        for name, other in changing:
-            self._plan_every(to, PLAN_NOW_S, name)
-            to.changeLane(name, other, 0.0)
+        for name, new_lane in changing:
+            self._plan_every(vehicle_api, PLAN_NOW_S, name)
+            vehicle_api.changeLane(name, new_lane, 0.0)
         return changing
 
-    def _plan_every(self, to: Any, seconds: float, name: str) -> None:
-        to.setActionStepLength(name, seconds, True)
+    def _plan_every(self, vehicle_api: Any, seconds: float, name: str) -> None:
+        vehicle_api.setActionStepLength(name, seconds, True)
 
     def _contacts(self, get_collisions: Callable[[], Iterable[Any]]) -> BoolArray:
         """Cells with a collision in this step; SUMO's list of colliding vehicles has those that are new alone."""
@@ -186,10 +187,10 @@ def open_shim(names: Sequence[str], told: FloatArray, x: FloatArray, v: FloatArr
 
 
 class Shim:
-    """Vehicles of one simulation, told, read and compared in one call: in arrays (n,) that stay where they are.
+    """Commands, reads and compares the vehicles of a simulation in one call, in arrays (n,) that are never moved.
 
-    ``told`` are the speeds (m/s) that they were last told, ``x`` and ``v`` where they should be after the coming step,
-    ``position`` (m) and ``speed`` where SUMO says they are.
+    ``told`` are the last commanded speeds (m/s), ``x`` and ``v`` positions and speeds as they should be after the
+    coming step, ``position`` (m) and ``speed`` those that SUMO reports.
     """
 
     def __init__(self, library: ctypes.CDLL, handle: int, told: FloatArray, x: FloatArray, v: FloatArray) -> None:
@@ -198,7 +199,7 @@ class Shim:
         finalize(self, library.shim_close, handle)
         self._wanted = np.zeros_like(told)
         arrays = self._wanted, told, x, v, self.position, self.speed
-        self._addresses = [array.ctypes.data for array in arrays]  # to ask for them takes longer than the call
+        self._addresses = [array.ctypes.data for array in arrays]  # slower to get than the call itself takes
         self.find_vehicles()
 
     def find_vehicles(self) -> None:
@@ -206,13 +207,13 @@ class Shim:
         if self._library.shim_find_vehicles(self._handle):
             raise self._error()
 
-    def step(self, wanted: FloatArray) -> bool:
-        """Tell the speeds that differ from ``told`` (noting them there), simulate one step, read all vehicles.
+    def step(self, speed: FloatArray) -> bool:
+        """Command the speeds that differ from ``told`` (and note them there), simulate one step, read all vehicles.
 
         Returns whether every position and speed is that of ``x`` and ``v``, in every bit. Raises `RuntimeError`: SUMO
         raised an error, or a vehicle has left the road.
         """
-        self._wanted[:] = wanted
+        self._wanted[:] = speed
         answer: int = self._library.shim_step(self._handle, *self._addresses)
         if answer == _FAILED:
             raise self._error()
@@ -289,10 +290,10 @@ class SumoWorld(SumoCells):
                 self._require_equal("m", self._get_position, self.x)
             if not np.array_equal(self._shim.speed, self.v.ravel()):
                 self._require_equal("m/s", self._get_speed, self.v)
-        for name, to in changing:
+        for name, new_lane in changing:
             self._plan_every(self._api.vehicle, NEVER_PLAN_S, name)
-            if (found := self._api.vehicle.getLaneIndex(name)) != to:
-                raise _disobeyed(f"{name}, lane", found, to)
+            if (lane_index := self._api.vehicle.getLaneIndex(name)) != new_lane:
+                raise _disobeyed(f"{name}, lane", lane_index, new_lane)
         self.lane[:] = lane
         return self._contacts(self._get_collisions)
 
@@ -313,9 +314,9 @@ class SumoWorld(SumoCells):
         names = names or self._flat
         read = list(map(getter, names))
         if struct.pack(f"{len(read)}d", *read) != expected.tobytes():  # a third faster than to compare numbers
-            for name, value, wanted in zip(names, read, expected.ravel().tolist(), strict=True):
-                if value != wanted:  # all but a zero's sign
-                    raise _disobeyed(f"{name}, {unit}", value, wanted)
+            for name, value, target in zip(names, read, expected.ravel().tolist(), strict=True):
+                if value != target:  # all but a zero's sign
+                    raise _disobeyed(f"{name}, {unit}", value, target)
 
     def close(self) -> None:
         """End the simulation; a world that is closed already leaves alone what others have opened since."""
@@ -339,9 +340,9 @@ def start_libsumo(arguments: Sequence[str]) -> Any:
         raise not_importable(str(error)) from error
     libsumo = vars(libsumo).get("__wrapped__", libsumo)
     libsumo.start(["sumo", *arguments])
-    # Who imports it from now on is a vehicle; a disagreement is put down to what it does there.
-    theirs = {key: value for key, value in vars(libsumo).items() if key[:2] == "__"}
-    theirs["__getattr__"] = lambda name: SumoWorld.lent.setdefault(name, getattr(libsumo, name))
-    sys.modules["libsumo"] = others = ModuleType("libsumo")
-    vars(others).update(theirs, __all__=dir(libsumo), __wrapped__=libsumo)
+    # Only a vehicle imports libsumo from now on: what it takes from there is noted, to explain a disagreement.
+    attributes = {key: value for key, value in vars(libsumo).items() if key[:2] == "__"}
+    attributes["__getattr__"] = lambda name: SumoWorld.lent.setdefault(name, getattr(libsumo, name))
+    sys.modules["libsumo"] = module = ModuleType("libsumo")
+    vars(module).update(attributes, __all__=dir(libsumo), __wrapped__=libsumo)
     return libsumo

@@ -123,9 +123,10 @@ class SumoAvWorld(SumoWorld):
         self._released: BoolArray = np.zeros(n_cells, np.bool_)
         self._wanted: FloatArray = np.zeros((n_cells, len(vehicles)))
         attributes = av_type(av)
-        written = " ".join(f"{name}={quoteattr(str(value))}" for name, value in attributes.items())
-        xml = f'<additional>\n    <vType id="{self._av_type}" {written}/>\n</additional>\n'
-        self._more_types, stderr = (SharedFile(xml.encode()),), SharedFile()
+        text = " ".join(f"{name}={quoteattr(str(value))}" for name, value in attributes.items())
+        xml = f'<additional>\n    <vType id="{self._av_type}" {text}/>\n</additional>\n'
+        self._more_types = (SharedFile(xml.encode()),)
+        stderr = SharedFile()
         try:
             with _stderr_to(stderr.path):
                 super().__init__(n_cells, vehicles)
@@ -134,8 +135,8 @@ class SumoAvWorld(SumoWorld):
             messages = [line.removeprefix("Error: ") for line in lines if line.startswith("Error: ")]
             if not messages:
                 raise
-            named = max((name for name in attributes if name.lower() in messages[0].lower()), key=len, default="")
-            where, values = (f"av.sumo.{named}", attributes[named]) if named else ("av.sumo", "values")
+            attribute = max((name for name in attributes if name.lower() in messages[0].lower()), key=len, default="")
+            where, values = (f"av.sumo.{attribute}", attributes[attribute]) if attribute else ("av.sumo", "values")
             found, mend = f"{values}, which SUMO refuses", f"SUMO says: {messages[0]}"
             raise CampaignError(where, found, "a vType that SUMO accepts", mend) from error
 
@@ -198,13 +199,13 @@ def sumo_seed(seed: int, episode: int) -> int:
 
 @contextmanager
 def _stderr_to(path: Path) -> Iterator[None]:
-    """Write what SUMO says to a file: libsumo's exception is no more than 'Process Error'."""
+    """Write SUMO's messages to a file: libsumo's exception says no more than 'Process Error'."""
     sys.stderr.flush()
-    kept = os.dup(2)
+    original = os.dup(2)
     try:
         with path.open("wb") as file:
             os.dup2(file.fileno(), 2)
             yield
     finally:
-        os.dup2(kept, 2)
-        os.close(kept)
+        os.dup2(original, 2)
+        os.close(original)

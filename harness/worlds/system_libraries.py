@@ -1,4 +1,4 @@
-"""Which libsumo is here, and shared libraries that SUMO's wheels expect of the system: missing ones, how they come.
+"""The version of libsumo; shared libraries that SUMO's wheels expect of the system, and how missing ones are installed.
 
 The wheels bring the others along (policy manylinux_2_28, PEP 600, names what they may leave out). The list is what the
 files of libsumo 1.28.0 and of eclipse-sumo 1.28.0 need and do not bring, the C library and the compiler's runtime
@@ -111,26 +111,26 @@ def install(missing: Sequence[SystemLibrary], commands: Sequence[Sequence[str]])
 
     Raises `HarnessError`: it failed, with what the package manager complained about.
     """
-    said: list[str] = []
+    output: list[str] = []
     for command in commands:
         # Standard input is left out, so that nothing waits for an answer; sudo asks at the terminal itself.
-        done = subprocess.run(  # noqa: S603 - our own words, and names from our own table
+        process = subprocess.run(  # noqa: S603 - our own words, and names from our own table
             command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, check=False
         )
-        said += done.stdout.splitlines()[-_QUOTED:] if done.returncode else []
-    if done.returncode:
-        found = f"exit code {done.returncode}: {' | '.join(said)}"
+        output += process.stdout.splitlines()[-_QUOTED:] if process.returncode else []
+    if process.returncode:
+        found = f"exit code {process.returncode}: {' | '.join(output)}"
         mend = f"See to what it says, or give your administrator the line for this system:\n{_install_lines(missing)}"
         raise HarnessError(shlex.join(commands[-1]), found, "the packages installed", mend)
 
 
 def require_libsumo() -> None:
-    """Import libsumo in a process of its own: what this one's loader did not find before, it may not look for again."""
+    """Import libsumo in another process: the loader of this one may not look again for what it did not find before."""
     command = [sys.executable, "-c", "import libsumo"]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)  # noqa: S603 - our own words
-    if done.returncode:
-        words = done.stderr.strip().splitlines()
-        raise not_importable(words[-1] if words else f"exit code {done.returncode}")
+    process = subprocess.run(command, capture_output=True, text=True, check=False)  # noqa: S603 - our own words
+    if process.returncode:
+        words = process.stderr.strip().splitlines()
+        raise not_importable(words[-1] if words else f"exit code {process.returncode}")
 
 
 def not_importable(words: str) -> HarnessError:

@@ -259,7 +259,7 @@ def test_it_does_in_tests_what_it_did_in_its_baseline_runs(name):
         ready.begin_after(runs)
         rows = np.linspace(0, ready.prescribed.available.sum() - 1, 60).astype(np.int64)
         shard = loop.run(1000, ready.prescribed.of_rows(rows, np.zeros(60, np.int64)))
-    assert not any(part.failures for part in done)
+    assert not runs.failed.any()
     assert shard.failures == {}
     moved = np.abs(runs.v_mps[np.arange(120), runs.n_steps] - runs.v_mps[:, 0]) > 0.1
     assert moved.mean() > 0.2 or name == "a program", "it never acted"  # but the client holds its speed, too

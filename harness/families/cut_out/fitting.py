@@ -34,7 +34,7 @@ LEAST_DROP = 0.002
 PRIOR_LOG_SD = 0.5
 """How wide the prior of a time's median and log-sd is [assumed]."""
 BOUNDS = [(math.log(low), math.log(high)) for low, high in ((0.1, 60.0), (0.01, 3.0))]
-"""Of both, as files may have them."""
+"""Logarithms of the limits of both in files."""
 LEAST_LATERAL_MPS = 0.1
 """Slower ones are wrong lateral positions, or a drift."""
 EVENT = np.dtype([("drop", np.float64), ("ttc_s", np.float64), ("lateral_mps", np.float64)])
@@ -46,13 +46,13 @@ class CutOutFitter(FollowingFitter):
     family, events = CUT_OUT, f"cut-outs that reveal a slower vehicle within {TTC_EDGES_S[-1]:g} s"
 
     def seen(self, track: Recording) -> Seen:
-        of = followed(track)
+        following = followed(track)
         ends = track.view[1, track.road]
-        leader = of.ahead[of.follows]
+        leader = following.ahead[following.follows]
         hours = float((track.s[leader] + IN_VIEW_M <= ends[leader]).sum()) / track.rate_hz / 3600.0
-        left = track.crosses(-1) | track.crosses(1)
-        row = np.flatnonzero(left & (of.behind >= 0) & (of.ahead >= 0) & (track.s + IN_VIEW_M <= ends))
-        closing, gap = -track.rate(of.ahead[row], row), track.gap(of.ahead[row], row)
+        leaves = track.crosses(-1) | track.crosses(1)
+        row = np.flatnonzero(leaves & (following.behind >= 0) & (following.ahead >= 0) & (track.s + IN_VIEW_M <= ends))
+        closing, gap = -track.rate(following.ahead[row], row), track.gap(following.ahead[row], row)
         events: RecordArray = np.empty(row.size, EVENT)
         events["drop"], events["ttc_s"] = closing / track.v[row], gap / np.maximum(closing, 1e-9)
         events["lateral_mps"] = np.abs(lateral_speeds(track, row))
@@ -61,21 +61,21 @@ class CutOutFitter(FollowingFitter):
 
     def share_counted(self, numbers: Numbers) -> float:
         fitted = {f"leaving__{name}": each["value"] for name, each in numbers.get("leaving", {}).items()}
-        of = SHIPPED | fitted
-        return share_within(*(of[f"leaving__{name}"] for name in ("ttc_median_s", "ttc_log_sd", "careless_share")))
+        values = SHIPPED | fitted
+        return share_within(*(values[f"leaving__{name}"] for name in ("ttc_median_s", "ttc_log_sd", "careless_share")))
 
     def numbers(self, events: RecordArray) -> Numbers:
         drops = events["drop"][events["drop"] < 1.0 - STANDS_MPS / 30.0]
         careless = [SHIPPED[f"leaving__careless_{name}"] for name in ("share", "least_s", "most_s")]
         (median, log_sd), errors = time_law(events["ttc_s"], *careless)
-        found = {"drop_mean": fitted_number(*drop_law(drops))}
-        found |= {"ttc_median_s": fitted_number(median, errors[0]), "ttc_log_sd": fitted_number(log_sd, errors[1])}
+        law = {"drop_mean": fitted_number(*drop_law(drops))}
+        law |= {"ttc_median_s": fitted_number(median, errors[0]), "ttc_log_sd": fitted_number(log_sd, errors[1])}
         logs = np.log(events["lateral_mps"][events["lateral_mps"] >= LEAST_LATERAL_MPS])
         if logs.size >= FEWEST_OF_LAW:
-            at, sd = math.exp(logs.mean()), float(logs.std(ddof=1))
-            found["lateral_median_mps"] = fitted_number(at, at * sd / math.sqrt(logs.size))
-            found["lateral_log_sd"] = fitted_number(sd, sd / math.sqrt(2.0 * logs.size))
-        return {"leaving": found}
+            lateral_median, sd = math.exp(logs.mean()), float(logs.std(ddof=1))
+            law["lateral_median_mps"] = fitted_number(lateral_median, lateral_median * sd / math.sqrt(logs.size))
+            law["lateral_log_sd"] = fitted_number(sd, sd / math.sqrt(2.0 * logs.size))
+        return {"leaving": law}
 
 
 def lateral_speeds(track: Recording, rows: IntArray) -> FloatArray:
@@ -108,8 +108,8 @@ def share_within(median_s: float, log_sd: float, careless: float) -> float:
 def time_law(ttc_s: FloatArray, share: float, least_s: float, most_s: float) -> tuple[FloatArray, FloatArray]:
     """Median and log-sd of times to collision (k,) up to the law's last edge, and their standard errors.
 
-    Log-normal, but for a ``share`` of careless drivers between two times, who are too few to be fitted. Where times go
-    on evenly up to the last edge, how long those beyond are says a prior alone, about the shipped law.
+    Log-normal, but for a ``share`` of careless drivers between two times, who are too few to be fitted. If times are
+    spread evenly up to the last edge, nothing but a prior about the shipped law says how long those beyond are.
     """
     log_t, shipped = np.log(ttc_s), np.log([SHIPPED["leaving__ttc_median_s"], SHIPPED["leaving__ttc_log_sd"]])
     careless = share / (most_s - least_s) * ((ttc_s >= least_s) & (ttc_s <= most_s))
@@ -123,9 +123,13 @@ def time_law(ttc_s: FloatArray, share: float, least_s: float, most_s: float) -> 
         return -float(np.log(likelihood + 1e-300).sum()) + 0.5 * float(away @ away)
 
     start = [log_t.mean(), math.log(log_t.std() + 1e-2)]
-    found = optimize.minimize(loss, start, method="Nelder-Mead", bounds=BOUNDS).x
+    best = optimize.minimize(loss, start, method="Nelder-Mead", bounds=BOUNDS).x
     steps = 1e-3 * np.eye(2)
-    bend = [[sum(a * b * loss(found + a * i + b * j) for a in (-1, 1) for b in (-1, 1)) for j in steps] for i in steps]
-    errors = np.sqrt(np.diag(np.linalg.inv(np.array(bend) / 4e-6)))
-    values = np.exp(found)
+
+    def second_difference(i: FloatArray, j: FloatArray) -> float:
+        return sum(a * b * loss(best + a * i + b * j) for a in (-1, 1) for b in (-1, 1))
+
+    hessian = np.array([[second_difference(i, j) for j in steps] for i in steps]) / 4e-6
+    errors = np.sqrt(np.diag(np.linalg.inv(hessian)))
+    values = np.exp(best)
     return values, values * errors

@@ -25,7 +25,7 @@ CLOSING = Shown(
     "closing speed of the one that leaves",
     "m/s",
     ("Closing", "speed"),
-    lambda of: of["closing_mps"],
+    lambda tests: tests["closing_mps"],
     beyond=1.15,
     cell=1.0,
 )
@@ -33,7 +33,7 @@ TTC = Shown(
     "its time to collision when it has left",
     "s",
     ("TTC when", "clear"),
-    lambda of: of["ttc_when_clear_s"],
+    lambda tests: tests["ttc_when_clear_s"],
     beyond=1.2,
     cell=0.25,
 )

@@ -37,9 +37,10 @@ Numbers = dict[str, dict[str, Any]]
 
 
 class Followed(NamedTuple):
-    """Who follows whom in a recording: by row (n,), the row of the vehicle ahead on the lane, -1 without one.
+    """Who follows whom in a recording of n rows.
 
-    ``follows`` (n,) are rows of drivers whose following counts, ``behind`` (n,) the row of such a driver who follows.
+    ``ahead`` (n,) is the row of the vehicle ahead on the lane, -1 without one; ``follows`` (n,) whether the driver's
+    following counts; ``behind`` (n,) the row of a driver whose following of this one counts, -1 without one.
     """
 
     ahead: IntArray
@@ -61,9 +62,9 @@ def followed(track: Recording) -> Followed:
 
 
 class Seen(NamedTuple):
-    """Hours of following in which events would have been seen, and the events; ``why`` a recording says nothing.
+    """Hours of following in which events would have been seen, and the events; ``why`` a recording is not counted.
 
-    Of the events one vehicle has done ``of_one``, and none more.
+    ``of_one`` is the largest number of events of one vehicle.
     """
 
     hours: float
@@ -109,61 +110,63 @@ class FollowingFitter:
     def observe(self, recording: Recording) -> None:
         self._seen.append(self.seen(recording))
 
-    def fitted(self, asked: FitRequest, others: Mapping[str, Fitted]) -> Fitted:
+    def fitted(self, request: FitRequest, others: Mapping[str, Fitted]) -> Fitted:
         base = self.family.default_parameters
         hours = math.fsum(each.hours for each in self._seen)
         events = np.concatenate([each.events for each in self._seen])
         law = self.numbers(events) if events.size >= FEWEST_OF_LAW else {}
-        content, told = self._exposure(events.size, hours, self.share_counted(law))
+        content, line = self._exposure(events.size, hours, self.share_counted(law))
         if law:
             content |= law
-            of = [(name, each) for own in law.values() for name, each in own.items()]
-            told += "; " + ", ".join(f"{name} {number(each['value'])} ± {number(each['se'], 2)}" for name, each in of)
+            fitted = [item for section in law.values() for item in section.items()]
+            line += "; " + ", ".join(f"{name} {number(n['value'])} ± {number(n['se'], 2)}" for name, n in fitted)
         elif events.size >= FEWEST_COUNTED:
-            told += f"; a law takes {FEWEST_OF_LAW}: kept is that of {base}"
-        told += self._in_scope(content)
-        silent, n = [each.why for each in self._seen if each.why], len(self._seen)
-        more = [f"! {self.family.name}: {len(silent)} of {n} recordings are not counted: {silent[0]}"] if silent else []
+            line += f"; a law takes {FEWEST_OF_LAW}: kept is that of {base}"
+        line += self._in_scope(content)
+        n, reasons = len(self._seen), [each.why for each in self._seen if each.why]
+        warnings = []
+        if reasons:
+            warnings.append(f"! {self.family.name}: {len(reasons)} of {n} recordings are not counted: {reasons[0]}")
         if (of_one := max(each.of_one for each in self._seen)) > max(1, MOST_OF_ONE * events.size):
             few = f"! {self.family.name}: {of_one} of {events.size} {self.events} are of one vehicle"
-            more.append(f"{few}: the limits, which take them to be independent, are too narrow")
-        head = [f"{n - len(silent)} recordings.", told, f"The rest is as in {base}.", *asked.provenance()]
-        [file] = self.marks(asked.out)
+            warnings.append(f"{few}: the limits, which take them to be independent, are too narrow")
+        head = [f"{n - len(reasons)} recordings.", line, f"The rest is as in {base}.", *request.provenance()]
+        [file] = self.marks(request.out)
         text = environment_text(head, {"like": base, **content})
         facts = {self.family.name: {"events": events.size, "hours": hours, **content}}
-        return Fitted({file: text.encode()}, (told, *more), facts)
+        return Fitted({file: text.encode()}, (line, *warnings), facts)
 
     def _exposure(self, n: int, hours: float, share: float) -> tuple[Numbers, str]:
-        """The rate of n events, where they are enough, and in words; counted are a ``share`` of all."""
-        kept = self.family.parameters(EnvironmentSettings()).exposure.per_hour
-        told = f"{self.family.name}: {n:,} {self.events} in {number(hours)} h of following"
-        of_all = hours * share
-        low, high = (float(f"{end / max(of_all, 1e-9):.4g}") for end in garwood(n, TAIL))
+        """Section with the rate of n counted events, a ``share`` of all, or with the shipped one; and both in words."""
+        shipped = self.family.parameters(EnvironmentSettings()).exposure.per_hour
+        line = f"{self.family.name}: {n:,} {self.events} in {number(hours)} h of following"
+        hours_of_all = hours * share
+        low, high = (float(f"{end / max(hours_of_all, 1e-9):.4g}") for end in garwood(n, TAIL))
         limits = f"{number(low, 2)} to {number(high, 2)}"
         if n >= FEWEST_COUNTED:
             part = f", {share:.3g} of all by the law" * (share < 0.9995)
             note = f"{n} in {hours:.4g} h of following{part}"
-            rate = {**fitted_number(n / of_all, math.sqrt(n) / of_all), "range": [low, high], "note": note}
-            counted = {"exposure": {"per_hour": rate, "events": n, "hours": round(of_all, 6)}}
-            far = low > FAR_ABOVE * (kept.range or [kept.value])[-1]
-            beside = f", {number(n / of_all / kept.value, 2)} times the shipped one (see docs/fit.md)" * far
-            return counted, f"{told}{part}: {number(n / of_all)} per hour ({limits}){beside}"
+            rate = {**fitted_number(n / hours_of_all, math.sqrt(n) / hours_of_all), "range": [low, high], "note": note}
+            counted = {"exposure": {"per_hour": rate, "events": n, "hours": round(hours_of_all, 6)}}
+            far = low > FAR_ABOVE * (shipped.range or [shipped.value])[-1]
+            beside = f", {number(n / hours_of_all / shipped.value, 2)} times the shipped one (see docs/fit.md)" * far
+            return counted, f"{line}{part}: {number(n / hours_of_all)} per hour ({limits}){beside}"
         needed = f", some {number(hours * FEWEST_COUNTED / n, 2)} h" if n else ""
-        outside = not low <= kept.value <= high
-        seen = {"note": f"{kept.note or kept.source}; {EXCLUDED}: {n} in {hours:.4g} h of following"}
-        content: Numbers = {"exposure": {"per_hour": kept.model_dump(exclude_none=True) | seen}} if outside else {}
+        outside = not low <= shipped.value <= high
+        remark = {"note": f"{shipped.note or shipped.source}; {EXCLUDED}: {n} in {hours:.4g} h of following"}
+        content: Numbers = {"exposure": {"per_hour": shipped.model_dump(exclude_none=True) | remark}} if outside else {}
         excluded = ", which these data exclude" if outside else ""
-        told += f" ({limits} per hour)" * (hours > 0.0)
-        told += f"; at least {FEWEST_COUNTED} are needed{needed}: kept is {number(kept.value)} per hour"
-        return content, f"{told} [{kept.source}]{excluded}, and the law of {self.family.default_parameters}"
+        line += f" ({limits} per hour)" * (hours > 0.0)
+        line += f"; at least {FEWEST_COUNTED} are needed{needed}: kept is {number(shipped.value)} per hour"
+        return content, f"{line} [{shipped.source}]{excluded}, and the law of {self.family.default_parameters}"
 
     def _in_scope(self, content: Numbers) -> str:
-        """Which part of the rate is tested, where that is not all."""
+        """In words: the part of the rate that is tested, unless all of it is."""
         settings = EnvironmentSettings()
-        kept = self.family.parameters(settings)
-        numbers = {f"{of}__{name}": each for of, own in content.items() for name, each in own.items()}
+        parameters = self.family.parameters(settings)
+        numbers = {f"{section}__{name}": each for section, entries in content.items() for name, each in entries.items()}
         values = {name: each["value"] for name, each in numbers.items() if isinstance(each, dict)}
-        traffic = self.family.traffic_with(settings, kept, values)
-        every = values.get("exposure__per_hour", kept.exposure.per_hour.value)
+        traffic = self.family.traffic_with(settings, parameters, values)
+        every = values.get("exposure__per_hour", parameters.exposure.per_hour.value)
         tested = number(every * (1.0 if traffic is None else self.family.share_in_scope(traffic)))
         return "" if tested == number(every) else f"; in scope, as --exposure takes them: {tested} per hour"

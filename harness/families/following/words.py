@@ -1,4 +1,4 @@
-"""Who is driven in the AV's place behind a vehicle, and what families of that kind say alike."""
+"""Drivers put in the AV's place behind a vehicle, and words that families of that kind have in common."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ STAND_INS = MappingProxyType(
 
 
 def words_of_following(*, event: str, then: str, depend: str, strikes: str, **own: Any) -> Words:
-    """What pages say of events: what the one ahead does ``then``, and on what assumed numbers rates ``depend``."""
+    """Words of pages; ``then`` is what the vehicle ahead does, ``depend`` the assumed numbers that rates depend on."""
     return Words(
         test=f"one {event} as in this traffic",
         event=event,

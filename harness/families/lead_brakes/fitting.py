@@ -20,10 +20,10 @@ from harness.fitting.tracks import noise_of, slope_weights
 from harness.vocabulary import BoolArray, FloatArray, IntArray, RecordArray
 
 LOWEST_MPS2 = 3.0
-"""Of the shipped law's peaks."""
+"""Lowest peak of the shipped law."""
 RELEASED_MPS2 = 1.0
 GROWS_MPS2 = 0.02
-"""More, from row to row, than a deceleration that is held [assumed]."""
+"""A deceleration that grows by more from row to row is not held [assumed]."""
 MEDIAN_S = 0.4
 """Time over which speeds are replaced by their median [assumed]."""
 SHORT_S, PRECISE_MPS2 = 0.5, 0.05
@@ -43,18 +43,20 @@ class BrakingFitter(FollowingFitter):
     family, events = LEAD_BRAKES, f"brakings of {LOWEST_MPS2:g} m/s² or more"
 
     def seen(self, track: Recording) -> Seen:
-        hard, known = decelerations(track, SHORT_S if noise_of(track, SHORT_S) < PRECISE_MPS2 else 1.0)
-        of = followed(track)
-        (row, events), (up, _) = (brakings(each, known, track.piece) for each in (hard, -hard))
-        followed_by = of.behind[row] >= 0
-        events, n_up = events[followed_by], int((of.behind[up] >= 0).sum())
-        hours = float((of.follows & known[of.ahead]).sum()) / track.rate_hz / 3600.0
+        deceleration, known = decelerations(track, SHORT_S if noise_of(track, SHORT_S) < PRECISE_MPS2 else 1.0)
+        following = followed(track)
+        row, events = brakings(deceleration, known, track.piece)
+        counts = following.behind[row] >= 0
+        events = events[counts]
+        speeds_up, _ = brakings(-deceleration, known, track.piece)
+        n_up = int((following.behind[speeds_up] >= 0).sum())
+        hours = float((following.follows & known[following.ahead]).sum()) / track.rate_hz / 3600.0
         if (noise := noise_of(track)) > MOST_NOISE_MPS2:
             why = f"noise of {noise:.2g} m/s² in decelerations: at most {MOST_NOISE_MPS2:g} tell brakings from errors"
         elif n_up > max(1.0, MOST_UPWARD * events.size):
             why = f"{n_up} vehicles speed up by {LOWEST_MPS2:g} m/s² or more, and {events.size} brake so: errors"
         else:
-            return Seen(hours, events, of_one=most_of_one(track.vehicle[row[followed_by]]))
+            return Seen(hours, events, of_one=most_of_one(track.vehicle[row[counts]]))
         return Seen(0.0, events[:0], why)
 
     def numbers(self, events: RecordArray) -> Numbers:
@@ -68,10 +70,10 @@ def decelerations(track: Recording, window_s: float) -> tuple[FloatArray, BoolAr
     weights = slope_weights(track, window_s)
     reach = weights.size // 2 + width // 2
     speeds = ndimage.median_filter(track.v, width, mode="nearest")
-    found = -ndimage.correlate1d(speeds, weights, mode="nearest")
+    deceleration = -ndimage.correlate1d(speeds, weights, mode="nearest")
     row = np.arange(track.v.size)
     first, last = np.maximum(row - reach, 0), np.minimum(row + reach, row.size - 1)
-    return found, (row - first == reach) & (last - row == reach) & (track.piece[first] == track.piece[last])
+    return deceleration, (row - first == reach) & (last - row == reach) & (track.piece[first] == track.piece[last])
 
 
 def brakings(hard: FloatArray, known: BoolArray, piece: IntArray) -> tuple[IntArray, RecordArray]:
@@ -81,8 +83,8 @@ def brakings(hard: FloatArray, known: BoolArray, piece: IntArray) -> tuple[IntAr
     begins beyond the lowest peak is none.
     """
     braking = known & (hard >= RELEASED_MPS2)
-    same = np.diff(piece) == 0
-    goes_on = np.append(False, braking[1:] & braking[:-1] & same)
+    same_piece = np.diff(piece) == 0
+    goes_on = np.append(False, braking[1:] & braking[:-1] & same_piece)
     first = np.flatnonzero(braking & ~goes_on)
     last = np.flatnonzero(braking & ~np.append(goes_on[1:], False))
     rows, events = [], []

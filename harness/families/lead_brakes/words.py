@@ -26,7 +26,8 @@ HEADWAY = Shown(
     "headway at the onset",
     "s",
     ("Headway at", "onset"),
-    lambda of: of["event_gap_m"] / np.maximum(of["lead_speed_mps"] - of["event_rate_mps"], 1.0),  # AV may stand
+    # The AV may stand.
+    lambda tests: tests["event_gap_m"] / np.maximum(tests["lead_speed_mps"] - tests["event_rate_mps"], 1.0),
     beyond=1.2,
     cell=0.1,
 )
@@ -34,7 +35,7 @@ PEAK = Shown(
     "peak deceleration",
     "m/s²",
     ("Peak", "deceleration"),
-    lambda of: of["peak_mps2"],
+    lambda tests: tests["peak_mps2"],
     beyond=1.2,
     cell=0.2,
     edges=np.arange(0.2, 15.1, 0.4),
@@ -44,7 +45,7 @@ HELD = Shown(
     "held for (at the right end: longer, or to standstill)",
     "s",
     ("Held",),
-    lambda of: np.minimum(of["held_s"], HELD_AT_MOST_S - 1e-3),
+    lambda tests: np.minimum(tests["held_s"], HELD_AT_MOST_S - 1e-3),
     beyond=1.0,
     cell=0.5,
     edges=np.arange(0.0, HELD_AT_MOST_S + 0.1, 0.5),

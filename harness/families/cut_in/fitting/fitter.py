@@ -44,7 +44,7 @@ HEAVIEST_TAILS = (None, 5.0, 8.0, 12.0, 30.0, 100.0)
 """Degrees of freedom of R1dot: fitted (None), then tried until LV's speed is one that SUMO's lanes allow."""
 DIGITS = 6
 MOST_NOISE_MPS2 = 0.05
-"""Of accelerations, which scatter by some 0.25 m/s²: more is told [assumed]."""
+"""Noise of accelerations above which the user is warned [assumed]; they scatter by some 0.25 m/s²."""
 MOST_DRAWS = 5
 """At most this many times the replicates asked for are drawn, as tests cannot be drawn from some."""
 
@@ -60,24 +60,24 @@ def fit_traffic(traffic: ObservedTraffic, where: str, progress: Progress) -> Fit
     if (hazard := fit_hazard(traffic)) is None:
         words = f"too few lane changes without a vehicle that closes in within {FREE_TTC_S:g} s to fit their hazard"
         raise TrajectoryError(where, words, "20 or more", "Add recordings.")
-    found = {}
+    fitted = {}
     for name, (law_of, _) in LAWS.items():
         progress.advance(1)
-        found[name] = law_of(traffic, numbers)
+        fitted[name] = law_of(traffic, numbers)
     progress.advance(1)
     acceptance = Acceptance.of(traffic, hazard)
     why = "too few data, or the law does not fit them"
     for df in HEAVIEST_TAILS:
         if df is not None:
-            found["rate"] = fit_rate(traffic, numbers | {"initial_state__r1dot_df": df}, kept="r1dot_df")
-        laws = {name: law for name, law in found.items() if law is not None} | {"hazard": hazard.law}
+            fitted["rate"] = fit_rate(traffic, numbers | {"initial_state__r1dot_df": df}, kept="r1dot_df")
+        laws = {name: law for name, law in fitted.items() if law is not None} | {"hazard": hazard.law}
         try:
             environment = _environment(base, laws, hazard.knots, acceptance, where)
             require_sound_laws(load_environment(EnvironmentSettings(), environment), where)
         except CampaignError as error:
             problem = error
             continue
-        kept = {LAWS[name][1]: why for name, law in found.items() if law is None}
+        kept = {LAWS[name][1]: why for name, law in fitted.items() if law is None}
         if df is not None:
             kept["degrees of freedom of R1dot"] = f"{df:g}: with heavier tails LV would exceed 100 m/s"
         return Fit(traffic, base, laws, kept, hazard, acceptance, environment)
@@ -91,7 +91,11 @@ def _rounded(value: float) -> float:
 
 
 def _environment(
-    base: EnvironmentParameters, laws: dict[str, FittedLaw], knots: Sequence[FloatArray], seen: Acceptance, where: str
+    base: EnvironmentParameters,
+    laws: dict[str, FittedLaw],
+    knots: Sequence[FloatArray],
+    acceptance: Acceptance,
+    where: str,
 ) -> EnvironmentParameters:
     """The base with fitted numbers, and with tables in place of the formulas that they replace."""
     content: dict[str, Any] = base.model_dump(exclude_none=True)
@@ -99,8 +103,8 @@ def _environment(
         for name in names:
             content["cut_in"].pop(name, None)
     tables: dict[str, Any] = {"hazard_table": {}, "acceptance_steps": {}}
-    for name, at in zip(HAZARD_OF, knots, strict=True):
-        tables["hazard_table"][name] = [{"value": knot, "source": "derived"} for knot in at.tolist()]
+    for name, axis_knots in zip(HAZARD_OF, knots, strict=True):
+        tables["hazard_table"][name] = [{"value": knot, "source": "derived"} for knot in axis_knots.tolist()]
     for law in laws.values():
         for path, value in law.estimate.items():
             section, key, *place = path.split("__")
@@ -117,10 +121,10 @@ def _environment(
     if "lead" in laws:
         content["lateral"]["longest_lead_s"].pop("note", None)  # it is about the share that the base cuts off
     edges = [{"value": edge, "source": "assumed"} for edge in TTC_EDGES_S.tolist()]
-    shares = zip(seen.shares.tolist(), seen.std_errors.tolist(), strict=True)
+    shares = zip(acceptance.shares.tolist(), acceptance.std_errors.tolist(), strict=True)
     steps = [{"value": _rounded(share), "source": "fitted", "se": _rounded(se)} for share, se in shares]
     steps[-1] = {"value": 1.0, "source": "assumed", "note": "the hazard is fitted where nobody closes in"}
-    counted = {"events": seen.events.tolist(), "exposure": list(map(_rounded, seen.exposure.tolist()))}
+    counted = {"events": acceptance.events.tolist(), "exposure": list(map(_rounded, acceptance.exposure.tolist()))}
     tables["acceptance_steps"] = {"ttc_s": edges, "share": steps, **counted}
     return validated({**content, **tables}, EnvironmentParameters, Places(where, {}))
 
@@ -134,33 +138,33 @@ def replicates(fit: Fit, n: int, seed: int, progress: Progress) -> dict[str, Flo
     settings, good = EnvironmentSettings(), []
     progress.stage("replicates", n)
     for _ in range(MOST_DRAWS):
-        drawn = _draw(fit, n, random)
-        for row in zip(*drawn.values(), strict=True):
-            if CUT_IN.traffic_with(settings, fit.environment, dict(zip(drawn, row, strict=True))) is None:
+        draws = _draw(fit, n, random)
+        for row in zip(*draws.values(), strict=True):
+            if CUT_IN.traffic_with(settings, fit.environment, dict(zip(draws, row, strict=True))) is None:
                 continue
             good.append(row)
             progress.advance(1)
             if len(good) == n:
-                return dict(zip(drawn, np.array(good).T, strict=True))
+                return dict(zip(draws, np.array(good).T, strict=True))
     found = f"{len(good)} of {MOST_DRAWS * n} replicates that tests can be drawn from"
     raise TrajectoryError("replicates", found, f"{n}", "Add recordings, or ask for fewer --replicates.")
 
 
 def _draw(fit: Fit, n: int, random: np.random.Generator) -> dict[str, list[float]]:
-    """Rows, by the names of their numbers, some of which tests cannot be drawn from."""
+    """Numbers of n replicates (n,) by name; from some of them tests cannot be drawn."""
     n_clusters = int(fit.traffic.cluster.max()) + 1
     times = random.multinomial(n_clusters, np.full(n_clusters, 1.0 / n_clusters), n) - 1.0
     times *= np.sqrt(n_clusters / random.chisquare(max(n_clusters - 1, 1), n))[:, None]
-    drawn: dict[str, list[float]] = {}
+    draws: dict[str, list[float]] = {}
     for name, law in fit.laws.items():
         theta, noise = law.maximum.theta, law.maximum.noise
-        moved = theta + times @ law.maximum.influence + random.standard_normal((n, noise.shape[1])) @ noise.T
-        values = law.values(moved)
-        drawn |= {key: values[:, i].tolist() for i, key in enumerate(law.names) if law.std_error[key] > 0.0}
+        coefficients = theta + times @ law.maximum.influence + random.standard_normal((n, noise.shape[1])) @ noise.T
+        values = law.values(coefficients)
+        draws |= {key: values[:, i].tolist() for i, key in enumerate(law.names) if law.std_error[key] > 0.0}
         if name == "hazard":
-            shares = fit.acceptance.drawn(moved, random)
-            drawn |= {f"acceptance_steps__share__{j}": shares[:, j].tolist() for j in range(TTC_EDGES_S.size)}
-    return drawn
+            shares = fit.acceptance.drawn(coefficients, random)
+            draws |= {f"acceptance_steps__share__{j}": shares[:, j].tolist() for j in range(TTC_EDGES_S.size)}
+    return draws
 
 
 # -- what is written --
@@ -179,37 +183,37 @@ class CutInFitter:
     def observe(self, recording: Recording) -> None:
         self._seen.append(observe(recording))
 
-    def fitted(self, asked: FitRequest, others: Mapping[str, Fitted]) -> Fitted:
-        where = places(asked.files)
-        tally = require_enough(self._seen, where, asked.read)
-        fit = fit_traffic(ObservedTraffic.of(self._seen), where, asked.progress)
-        rows = replicates(fit, asked.n_replicates, asked.seed, asked.progress)
+    def fitted(self, request: FitRequest, others: Mapping[str, Fitted]) -> Fitted:
+        where = places(request.files)
+        tally = require_enough(self._seen, where, request.read)
+        fit = fit_traffic(ObservedTraffic.of(self._seen), where, request.progress)
+        rows = replicates(fit, request.n_replicates, request.seed, request.progress)
         noise_mps2 = math.sqrt(math.fsum(each.noise_mps2**2 for each in self._seen) / len(self._seen))
-        out, shown, beside = self.marks(asked.out)
-        drawn = parquet(pa.table(rows, metadata={OF_REPLICATES: fit.environment.content_hash()}))
-        tied = {"replicates": {"file": beside.name, "sha256": content_hash(drawn)}}
-        text = f"{_text(fit, tally, asked)}\n{yaml_text(tied)}"
-        told = [line for each in others.values() for line in each.told]
-        shows = page(fit, tally, noise_mps2, asked, told)
-        files = {out: text.encode(), shown: shows.encode(), beside: drawn}
-        return Fitted(files, _told(fit, tally, asked, noise_mps2), _facts(fit, tally))
+        out, html, replicates_file = self.marks(request.out)
+        table = parquet(pa.table(rows, metadata={OF_REPLICATES: fit.environment.content_hash()}))
+        reference = {"replicates": {"file": replicates_file.name, "sha256": content_hash(table)}}
+        text = f"{_text(fit, tally, request)}\n{yaml_text(reference)}"
+        lines = [line for each in others.values() for line in each.told]
+        text_of_page = page(fit, tally, noise_mps2, request, lines)
+        files = {out: text.encode(), html: text_of_page.encode(), replicates_file: table}
+        return Fitted(files, _told(fit, tally, request, noise_mps2), _facts(fit, tally))
 
 
-def _text(fit: Fit, tally: BesideCounts, asked: FitRequest) -> str:
+def _text(fit: Fit, tally: BesideCounts, request: FitRequest) -> str:
     clusters = "recording" if fit.traffic.by_recording else "vehicle, as recordings are few"
     head = [
         f"{fit.traffic.n_recordings} recordings: "
         f"{tally.vehicles:,} vehicles, {tally.driven_s / 3600.0:.2f} h beside the target lane,",
         f"{tally.used} lane changes to it. Standard errors (se) and replicates are by {clusters}.",
         f"Numbers that are not fitted are those of {BASE}. Use lane_change_level 1 with this traffic.",
-        *asked.provenance(),
+        *request.provenance(),
     ]
     return environment_text(head, fit.environment.model_dump(exclude_defaults=True))
 
 
-def _told(fit: Fit, tally: BesideCounts, asked: FitRequest, noise_mps2: float) -> tuple[str, ...]:
+def _told(fit: Fit, tally: BesideCounts, request: FitRequest, noise_mps2: float) -> tuple[str, ...]:
     traffic, steps, unseen = fit.traffic, fit.acceptance, fit.environment.unseen
-    side = "left" if asked.read.mirror else "right"
+    side = "left" if request.read.mirror else "right"
     noisy = f"! noise of {noise_mps2:.2g} m/s² in accelerations: the scatter of the fitted ones is off by as much"
     turned = (
         f"! in {tally.turned} directions of recordings vehicles close in on the other side: are lanes numbered alike?"
@@ -220,12 +224,12 @@ def _told(fit: Fit, tally: BesideCounts, asked: FitRequest, noise_mps2: float) -
         f"target lane; {tally.used:,} lane changes to the {side} used of {tally.changes:,}",
         f"in front of a vehicle that closes in within 8 s: {int(steps.events[:-1].sum()):,} lane changes; "
         f"{steps.exposure[:-1].sum():.1f} expected if nobody minded it",
-        *(f"kept as in {BASE}: {what} ({why})" for what, why in fit.kept.items()),
+        *(f"kept as in {BASE}: {subject} ({why})" for subject, why in fit.kept.items()),
         f"cut_in: exposure is not fitted: kept is {EXPOSURE.per_hour:g} per hour, counted in other trajectories",
         *([noisy] if noise_mps2 > MOST_NOISE_MPS2 else []),
         *([turned] if tally.turned else []),
         *([limited] if unseen else []),
-        *(f"! {words}" for words in too_few(asked.n_replicates, CONFIDENCE)),
+        *(f"! {words}" for words in too_few(request.n_replicates, CONFIDENCE)),
     )
 
 

@@ -42,7 +42,7 @@ class Hazard:
 
 
 def fit_hazard(traffic: ObservedTraffic) -> Hazard | None:
-    """Fit it; None if there is no lane change, or no maximum is found."""
+    """Fit the hazard; None if there is no lane change, or no maximum is found."""
     rows = traffic.at_risk[traffic.at_risk["ttc_s"] > FREE_TTC_S]
     n_changes = int(rows["changes"].sum())
     if not n_changes:
@@ -65,10 +65,10 @@ def fit_hazard(traffic: ObservedTraffic) -> Hazard | None:
     centre = np.zeros(weights.shape[1])
     centre[0] = math.log(n_changes / rows["duration_s"].sum())
     prior = Prior(centre, weights, smooths=True)
-    found = maximise(log_likelihood, rows, [_design(knots, rows)], *traffic.members(rows), prior)
+    maximum = maximise(log_likelihood, rows, [_design(knots, rows)], *traffic.members(rows), prior)
     axes = zip(HAZARD_OF.values(), knots, strict=True)
     names = tuple(f"hazard_table__{name}__{i}" for name, each in axes for i in range(each.size))
-    return None if found is None else Hazard(FittedLaw(names, values, found), knots)
+    return None if maximum is None else Hazard(FittedLaw(names, values, maximum), knots)
 
 
 def _but_middle(by_knot: FloatArray) -> FloatArray:
@@ -79,20 +79,20 @@ def _but_middle(by_knot: FloatArray) -> FloatArray:
 def _design(knots: list[FloatArray], rows: RecordArray) -> FloatArray:
     """Design matrix (n, p) of the log-hazard in some states (n,)."""
     hats = [
-        np.column_stack([np.interp(rows[name], at, hat) for hat in np.eye(at.size)])
-        for name, at in zip(HAZARD_OF, knots, strict=True)
+        np.column_stack([np.interp(rows[name], axis_knots, hat) for hat in np.eye(axis_knots.size)])
+        for name, axis_knots in zip(HAZARD_OF, knots, strict=True)
     ]
     return np.column_stack([np.ones(rows.size), *map(_but_middle, hats)])
 
 
 def _knots(rows: RecordArray, name: str) -> FloatArray:
     """Rounded quantiles (means of those at crossings and at risk), at least a twentieth of their range apart."""
-    at = 0.5 * (np.quantile(rows[name], KNOTS) + np.quantile(rows[name][rows["changes"]], KNOTS))
-    found = [round(float(at[0]), 1)]
-    for each in np.round(at[1:], 1).tolist():
-        if each - found[-1] > 0.05 * (at[-1] - at[0]):
-            found.append(each)
-    return np.array(found)
+    quantiles = 0.5 * (np.quantile(rows[name], KNOTS) + np.quantile(rows[name][rows["changes"]], KNOTS))
+    knots = [round(float(quantiles[0]), 1)]
+    for knot in np.round(quantiles[1:], 1).tolist():
+        if knot - knots[-1] > 0.05 * (quantiles[-1] - quantiles[0]):
+            knots.append(knot)
+    return np.array(knots)
 
 
 def _penalty(knots: FloatArray) -> FloatArray:
@@ -123,14 +123,14 @@ class Acceptance:
     def of(cls, traffic: ObservedTraffic, hazard: Hazard) -> Acceptance:
         """Count lane changes and what is expected."""
         rows = traffic.at_risk
-        at = np.searchsorted(TTC_EDGES_S, rows["ttc_s"], side="right")
+        step = np.searchsorted(TTC_EDGES_S, rows["ttc_s"], side="right")
         n = TTC_EDGES_S.size + 1
-        events = np.bincount(at[rows["changes"]], minlength=n).astype(np.int64)
+        events = np.bincount(step[rows["changes"]], minlength=n).astype(np.int64)
         wished = hazard.rate(rows) * rows["duration_s"]
-        near = at < n - 1
-        exposure = np.bincount(at, wished, minlength=n).astype(np.float64)
+        near = step < n - 1
+        exposure = np.bincount(step, wished, minlength=n).astype(np.float64)
         design = _design(hazard.knots, rows[near])
-        return cls(events, exposure, design, at[near].astype(np.int64), rows["duration_s"][near])
+        return cls(events, exposure, design, step[near].astype(np.int64), rows["duration_s"][near])
 
     @property
     def shares(self) -> FloatArray:

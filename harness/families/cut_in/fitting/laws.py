@@ -47,16 +47,17 @@ class ObservedTraffic:
     @classmethod
     def of(cls, observations: Iterable[Observations]) -> ObservedTraffic:
         """Join recordings."""
-        whole = {name: [np.empty(0, dtype)] for name, dtype in KINDS.items()}
+        by_kind = {name: [np.empty(0, dtype)] for name, dtype in KINDS.items()}
         recording = list[int]()
-        for i, seen in enumerate(observations):
-            before = len(recording)
-            for name, parts in whole.items():
-                rows = getattr(seen, name).copy()
-                rows["vehicle"] += before
+        for i, observed in enumerate(observations):
+            n_before = len(recording)
+            for name, parts in by_kind.items():
+                rows = getattr(observed, name).copy()
+                rows["vehicle"] += n_before
                 parts.append(rows)
                 recording += [i] * (int(rows["vehicle"].max(initial=-1)) + 1 - len(recording))
-        return cls(**{name: np.concatenate(parts) for name, parts in whole.items()}, recording=np.array(recording, int))
+        columns = {name: np.concatenate(parts) for name, parts in by_kind.items()}
+        return cls(**columns, recording=np.array(recording, int))
 
     @property
     def n_recordings(self) -> int:
@@ -132,7 +133,7 @@ LINKS: dict[str, tuple[Callable[[float], float], Callable[[FloatArray], FloatArr
     "r1dot_df": (lambda df: math.log(df - 2.0), _df),
     "df": (lambda df: math.log(df - 2.0), _df),
 }
-"""Coefficient of a number, and number of a coefficient, where they are not the same."""
+"""Functions from number to coefficient and back, where they are not the same."""
 
 
 def _fitted(
@@ -148,16 +149,16 @@ def _fitted(
     kept: str = "",
     counted: tuple[RecordArray, IntArray] | None = None,
 ) -> FittedLaw | None:
-    """A law whose numbers are its coefficients, with the prior's ``spread`` by name, around the base's, or its own.
+    """Fit a law whose numbers are its coefficients; the prior is around the base's numbers, with ``spread`` by name.
 
-    Rows may be ``counted`` by kinds (k,) that likelihood and designs are of, and the kind of each row (n,).
+    With ``counted`` likelihood and designs are of kinds of rows (k,): these kinds, and the kind of each row (n,).
     """
     data, cell = counted or (rows, None)
     by_name = {name: base[f"{section}__{name}"] for name in spread}
     centre = [LINKS[name][0](value) if name in LINKS else value for name, value in by_name.items()]
-    prior, at = Prior.of(centre, list(spread.values())), np.array([name == kept for name in spread])
-    members = traffic.members(rows, cell)
-    found = maximise(log_likelihood, data, designs, *members, prior, starts, kept=at)
+    prior = Prior.of(centre, list(spread.values()))
+    is_kept = np.array([name == kept for name in spread])
+    maximum = maximise(log_likelihood, data, designs, *traffic.members(rows, cell), prior, starts, kept=is_kept)
 
     def values(theta: FloatArray) -> FloatArray:
         out = np.array(theta)
@@ -166,7 +167,7 @@ def _fitted(
                 out[..., i] = LINKS[name][1](theta[..., i])
         return out
 
-    return None if found is None else FittedLaw(tuple(f"{section}__{name}" for name in spread), values, found)
+    return None if maximum is None else FittedLaw(tuple(f"{section}__{name}" for name in spread), values, maximum)
 
 
 # -- initial states --
@@ -293,12 +294,12 @@ def fit_free_driving(traffic: ObservedTraffic, base: Base) -> FittedLaw | None:
 
 def guard_caps(r1: FloatArray, r1dot: FloatArray, base: Base) -> IntArray:
     """Index of the largest acceleration that the guard allows (`harness.families.cut_in.laws.guard_cap`)."""
-    h, own = base["guard__horizon_s"], base["guard__own_braking_mps2"]
+    h, own_braking = base["guard__horizon_s"], base["guard__own_braking_mps2"]
     cap = np.full(r1.size, -1)
     for acceleration in ACCELERATIONS_MPS2:
         closing = acceleration + base["guard__lead_braking_mps2"]
         rate = np.maximum(0.0, closing * h - r1dot)
-        cap += r1 + r1dot * h - 0.5 * closing * h * h - rate * rate / (2.0 * own) >= base["guard__margin_m"]
+        cap += r1 + r1dot * h - 0.5 * closing * h * h - rate * rate / (2.0 * own_braking) >= base["guard__margin_m"]
     return np.asarray(np.maximum(cap, 0), np.int64)
 
 
@@ -319,10 +320,10 @@ def fit_car_following(traffic: ObservedTraffic, base: Base) -> FittedLaw | None:
     prior = Prior.of(centre, [0.5, 0.01, 0.3, 0.3, 0.3, 1.0, 1.5, 1.0, 1.5])
 
     r1, r1dot, u = rows["r1_m"], rows["r1dot_mps"], _scaled(base, rows["v_mps"])
-    needed = r1dot * r1dot / (2.0 * np.maximum(r1 - n["standstill_m"], n["smallest_gap_m"]))
-    closing = (r1dot < 0.0) & (needed > n["closing_threshold_mps2"])
+    needed_mps2 = r1dot * r1dot / (2.0 * np.maximum(r1 - n["standstill_m"], n["smallest_gap_m"]))
+    closing = (r1dot < 0.0) & (needed_mps2 > n["closing_threshold_mps2"])
     mean = np.where(closing[:, None], 0.0, _columns(rows.size, r1dot, r1, -1.0, -u, -u * u, 0.0))
-    mean[closing, -1] = -needed[closing]
+    mean[closing, -1] = -needed_mps2[closing]
     scale = _columns(rows.size, 1.0, np.minimum(np.abs(r1dot), n["rate_cap_mps"]))
     binned = _binned(bins(rows["acceleration_mps2"]), guard_caps(r1, r1dot, base))
 
@@ -341,12 +342,12 @@ def fit_car_following(traffic: ObservedTraffic, base: Base) -> FittedLaw | None:
         designs = [mean, scale, np.ones((rows.size, 1))]
         return maximise(log_likelihood, binned, designs, *traffic.members(rows), prior, kept=kept)
 
-    found = fitted()
-    if found is not None and found.theta[1] < 3.0 * math.sqrt(found.covariance()[1, 1]):
-        found = fitted(np.arange(prior.centre.size) == 1)  # gaps are divided by it
+    maximum = fitted()
+    if maximum is not None and maximum.theta[1] < 3.0 * math.sqrt(maximum.covariance()[1, 1]):
+        maximum = fitted(np.arange(prior.centre.size) == 1)  # gaps are divided by it
     names = ("gain_rate_per_s", "gain_gap_per_s2", "median_gap_m", "median_gap_v", "median_gap_vv", "closing_gain")
     named = tuple(f"car_following__{name}" for name in (*names, "df", "log_scale", "log_scale_rate"))
-    return None if found is None else FittedLaw(named, values, found)
+    return None if maximum is None else FittedLaw(named, values, maximum)
 
 
 def fit_leads(traffic: ObservedTraffic, base: Base) -> FittedLaw | None:
@@ -364,13 +365,13 @@ def fit_leads(traffic: ObservedTraffic, base: Base) -> FittedLaw | None:
 
     logs = np.log(np.clip(rows["lead_s"], STEP_S, longest_s))
     prior = Prior.of([float(logs.mean()), math.log(max(float(logs.std()), 0.05))], [3.0, 2.0])
-    found = maximise(log_likelihood, rows, [np.ones((rows.size, 1))] * 2, *traffic.members(rows), prior)
+    maximum = maximise(log_likelihood, rows, [np.ones((rows.size, 1))] * 2, *traffic.members(rows), prior)
 
     def values(theta: FloatArray) -> FloatArray:
         return np.stack([base["lateral__distance_m"] * np.exp(-theta[..., 0]), np.exp(theta[..., 1])], axis=-1)
 
     names = "lateral__speed_median_mps", "lateral__speed_log_sd"
-    return None if found is None else FittedLaw(names, values, found)
+    return None if maximum is None else FittedLaw(names, values, maximum)
 
 
 LAWS: dict[str, tuple[Callable[[ObservedTraffic, Base], FittedLaw | None], str]] = {
@@ -381,4 +382,4 @@ LAWS: dict[str, tuple[Callable[[ObservedTraffic, Base], FittedLaw | None], str]]
     "car following": (fit_car_following, "accelerations behind a leader"),
     "lead": (fit_leads, "leads of lane changes"),
 }
-"""Laws that may be kept from the base, and what they are of."""
+"""Laws that may be kept from the base: how each is fitted, and what it is a law of."""

@@ -23,10 +23,10 @@ LogLikelihood = Callable[..., FloatArray]
 MOSTLY_PRIOR = 0.5
 """Prior's share of a number's information above which the data do not determine it [assumed]."""
 EXCLUDES = 2.0
-"""Loss of log-likelihood above which the data exclude the value that would be kept, even if they determine no other
-[assumed]: a share that was never seen is small."""
+"""Loss of log-likelihood above which the data exclude the base's value, so that it is not kept, even if they do not
+determine another [assumed]: a share without a single event is small, whatever the base says."""
 MOST_LEVERAGE = 0.5
-"""Influences are divided by 1 - leverage, as in HC3, else few rows look too precise; leverage counts at most this."""
+"""Largest leverage that counts. Influences are divided by 1 - leverage, as in HC3: few rows would look too precise."""
 _STEP = 1e-3
 _MOST_ROUNDS = 200
 _ROWS_AT_FIRST = 20_000
@@ -96,21 +96,21 @@ def maximise(
     of the prior's centre and other starts counts. Coefficients that are ``kept`` (p,) stay at the centre.
     """
     kept = np.zeros(prior.centre.size, np.bool_) if kept is None else kept.copy()
-    whole = _Sum(log_likelihood, rows, designs, members, prior.fixed(kept))
-    thinned = whole.thinned() if rows.size > 2 * _ROWS_AT_FIRST else whole
-    found = [thinned.climb(start) for start in (prior.centre, *starts)]
-    best = max((each for each in found if each is not None), key=lambda each: each[1], default=None)
-    if best is not None and thinned is not whole:
-        best = whole.climb(best[0])
+    full = _Sum(log_likelihood, rows, designs, members, prior.fixed(kept))
+    thinned = full.thinned() if rows.size > 2 * _ROWS_AT_FIRST else full
+    climbed = [thinned.climb(start) for start in (prior.centre, *starts)]
+    best = max((each for each in climbed if each is not None), key=lambda each: each[1], default=None)
+    if best is not None and thinned is not full:
+        best = full.climb(best[0])
     while best is not None:
         theta, _ = best
-        scores, curvature = whole.derivatives(theta)
+        scores, curvature = full.derivatives(theta)
         inverse = linalg.inv(curvature)
         silent = ~kept & (np.diag(inverse) * np.diag(prior.precision) > MOSTLY_PRIOR)
         simpler = None
         if silent.any() and not prior.smooths:
-            whole.prior = prior.fixed(kept | silent)
-            simpler = whole.climb(np.where(kept | silent, prior.centre, theta))
+            full.prior = prior.fixed(kept | silent)
+            simpler = full.climb(np.where(kept | silent, prior.centre, theta))
         if simpler is None or best[1] - simpler[1] > EXCLUDES:
             weights = prior.weights * ~kept
             moves = scores @ inverse
@@ -138,9 +138,10 @@ class _Sum:
     def thinned(self) -> _Sum:
         """The sum over a part of the rows, weighted to stand for all."""
         n = self.rows.size
-        few = np.arange(0, n, n // _ROWS_AT_FIRST)
-        designs = [design[few] for design in self.designs]
-        return replace(self, rows=self.rows[few], designs=designs, members=self.members[:, few] * (n / few.size))
+        sample = np.arange(0, n, n // _ROWS_AT_FIRST)
+        designs = [design[sample] for design in self.designs]
+        members = self.members[:, sample] * (n / sample.size)
+        return replace(self, rows=self.rows[sample], designs=designs, members=members)
 
     def _predictors(self, theta: FloatArray) -> list[FloatArray]:
         parts = np.split(theta, self._ends[:-1])
@@ -159,11 +160,11 @@ class _Sum:
         eta = self._predictors(theta)
         k = len(eta)
 
-        def at(*moved: int) -> FloatArray:
-            shifted = list(eta)
-            for each in moved:  # ±(predictor + 1)
-                shifted[abs(each) - 1] = shifted[abs(each) - 1] + np.sign(each) * _STEP
-            return self.log_likelihood(self.rows, *shifted)
+        def at(*moves: int) -> FloatArray:
+            predictors = list(eta)
+            for move in moves:  # ±(predictor + 1)
+                predictors[abs(move) - 1] = predictors[abs(move) - 1] + np.sign(move) * _STEP
+            return self.log_likelihood(self.rows, *predictors)
 
         with np.errstate(all="ignore"):
             middle, up, down = at(), [at(j + 1) for j in range(k)], [at(-j - 1) for j in range(k)]
@@ -172,8 +173,8 @@ class _Sum:
             for i in range(k):
                 second[i][i] = (up[i] + down[i] - 2.0 * middle) / _STEP**2
                 for j in range(i):
-                    both = at(i + 1, j + 1) + at(-i - 1, -j - 1) + 2.0 * middle
-                    second[i][j] = second[j][i] = (both - up[i] - up[j] - down[i] - down[j]) / (2.0 * _STEP**2)
+                    diagonal = at(i + 1, j + 1) + at(-i - 1, -j - 1) + 2.0 * middle
+                    second[i][j] = second[j][i] = (diagonal - up[i] - up[j] - down[i] - down[j]) / (2.0 * _STEP**2)
         scores = np.hstack([self.members @ (self.designs[j] * first[j][:, None]) for j in range(k)])
         blocks = [
             [-self.designs[i].T @ (self.designs[j] * (self._counts * second[i][j])[:, None]) for j in range(k)]

@@ -86,9 +86,9 @@ class BesideCounts(NamedTuple):
     """Directions of recordings in which it is nearly always on the other side."""
 
     @classmethod
-    def of(cls, found: Iterable[Observations]) -> BesideCounts:
+    def of(cls, observations: Iterable[Observations]) -> BesideCounts:
         """Sum over recordings."""
-        summed: list[Any] = [sum(counts) for counts in zip(*(each.tally for each in found), strict=True)]
+        summed: list[Any] = [sum(counts) for counts in zip(*(each.tally for each in observations), strict=True)]
         return cls(*summed)
 
 
@@ -123,25 +123,25 @@ def observe(track: Recording) -> Observations:
     n = track.second
     changes = np.flatnonzero(track.crosses(-1) & track.fitted)
     chosen = track.fitted & (track.frame % n == 0)
-    other_rows = np.flatnonzero(chosen & track.has_lane(1))
+    other_side_rows = np.flatnonzero(chosen & track.has_lane(1))
     chosen[changes] = True
     rows = np.flatnonzero(chosen & track.has_lane(-1))
-    whole = track.frame[rows] % n == 0
+    on_second = track.frame[rows] % n == 0
     scene = Scene(track, chosen)
-    state, other = scene.states(rows, -1), scene.states(other_rows, 1)
+    state, other_side = scene.states(rows, -1), scene.states(other_side_rows, 1)
     duration_s = durations_s(track, rows)
 
-    second = whole & track.same_run(rows, n)
+    second = on_second & track.same_run(rows, n)
     acceleration = np.full(rows.size, np.nan)
     acceleration[second] = slopes(track, rows[second])
-    seen = state["leads"] | (track.s[rows] + R1_MAX_M <= track.view[1, track.road[rows]])
+    in_view = state["leads"] | (track.s[rows] + R1_MAX_M <= track.view[1, track.road[rows]])
     since = track.frame[rows] - track.frame[np.searchsorted(track.vehicle, track.vehicle[rows])]
     crosses = np.isin(rows, changes)
     columns = state | {"vehicle": track.vehicle[rows], "duration_s": duration_s}
     columns |= {"acceleration_mps2": acceleration, "changes": crosses}
     fits, follows, behind, at_risk = (state[name] for name in ("fits", "follows", "behind", "at_risk"))
-    near = track.road[rows[whole & at_risk & (state["ttc_s"] < CLOSING_TTC_S)]]
-    far = track.road[other_rows[other["at_risk"] & (other["ttc_s"] < CLOSING_TTC_S)]]
+    near = track.road[rows[on_second & at_risk & (state["ttc_s"] < CLOSING_TTC_S)]]
+    far = track.road[other_side_rows[other_side["at_risk"] & (other_side["ttc_s"] < CLOSING_TTC_S)]]
     closing, elsewhere = (np.bincount(of_road, minlength=track.road.max() + 1) for of_road in (near, far))
     leads, odd = _leads(track, rows[crosses & fits])
     overlaps = follows & (state["r1_m"] < OVERLAP_M)
@@ -161,9 +161,9 @@ def observe(track: Recording) -> Observations:
     )
     return Observations(
         track.name,
-        _records("free", columns, second & fits & ~follows & seen),
+        _records("free", columns, second & fits & ~follows & in_view),
         _records("following", columns, second & behind),
-        _records("initial", columns, whole & behind & (since // n % INITIAL_EVERY_S == 0)),
+        _records("initial", columns, on_second & behind & (since // n % INITIAL_EVERY_S == 0)),
         _records("at_risk", columns, at_risk),
         leads,
         noise_of(track),
@@ -189,7 +189,7 @@ def _leads(track: Recording, crossings: IntArray) -> tuple[RecordArray, int]:
     positions: the law's motion at constant lateral speed. Where none is seen, the lead is the time that was searched,
     at least `SEEN_BEFORE_S`.
     """
-    found, odd = [], 0
+    leads, odd = [], 0
     for row in crossings:
         window = round(LATERAL_WINDOW_S * track.rate_hz)
         near = np.arange(max(row - window + 1, 0), min(row + window + 1, track.run.size))
@@ -207,8 +207,8 @@ def _leads(track: Recording, crossings: IntArray) -> tuple[RecordArray, int]:
         if before_s[0] <= -SEEN_BEFORE_S:
             onset = _onset(before_s, track.lateral[reach])
             lead_s = -onset if onset - before_s[0] >= LEVEL_S else -before_s[0]
-            found.append((track.vehicle[row], lead_s, abs(speed)))
-    return np.array(found, KINDS["leads"]), odd
+            leads.append((track.vehicle[row], lead_s, abs(speed)))
+    return np.array(leads, KINDS["leads"]), odd
 
 
 def _onset(time_s: FloatArray, lateral: FloatArray) -> float:
@@ -222,16 +222,16 @@ def _onset(time_s: FloatArray, lateral: FloatArray) -> float:
 # -- is it enough? --
 
 
-def require_enough(found: Sequence[Observations], where: str, mapping: Mapping) -> BesideCounts:
+def require_enough(observations: Sequence[Observations], where: str, mapping: Mapping) -> BesideCounts:
     """Refuse recordings that are too few, or that were read wrongly by the ``mapping``; the sum of their counts.
 
     Raises `TrajectoryError`: a rule is broken; it says which, and by which recording most; ``where`` names the files.
     """
-    total = BesideCounts.of(found)
+    total = BesideCounts.of(observations)
 
     def refuse(words: str, expected: str, mend: str, column: str = "", most: str = "") -> TrajectoryError:
-        largest = max(found, key=lambda each: float(getattr(each.tally, most or "used")))
-        if most and len(found) > 1 and getattr(largest.tally, most) > 0.5 * getattr(total, most):
+        largest = max(observations, key=lambda each: float(getattr(each.tally, most or "used")))
+        if most and len(observations) > 1 and getattr(largest.tally, most) > 0.5 * getattr(total, most):
             name = largest.recording
             words, mend = f"{words}; most of it in recording {name}", f"{mend} Or leave it out: --leave-out '{name}'."
         return TrajectoryError(f"{where}, {column}" if column else where, words, expected, mend)
@@ -265,7 +265,7 @@ def require_enough(found: Sequence[Observations], where: str, mapping: Mapping) 
          f"all), in {hours:.1f} vehicle-hours beside the target lane",
          f"at least {FEWEST_CHANGES}", f"Add recordings: {needed}.", "", ""),
     ]  # fmt: skip
-    for broken, *told in rules:
+    for broken, *problem in rules:
         if broken:
-            raise refuse(*told)
+            raise refuse(*problem)
     return total

@@ -52,13 +52,13 @@ class Fit:
     environment: EnvironmentParameters
 
 
-def page(fit: Fit, tally: BesideCounts, noise_mps2: float, asked: FitRequest, others: Sequence[str]) -> str:
+def page(fit: Fit, tally: BesideCounts, noise_mps2: float, request: FitRequest, others: Sequence[str]) -> str:
     """The page; ``noise_mps2`` is the sd of accelerations by measurement, ``others`` is what other families found."""
     template = templates(__package__).get_template("fit.html.j2")
-    shown = template.render(
+    html = template.render(
         fit=fit,
         tally=tally,
-        asked=asked,
+        asked=request,
         plots=list(_plots(fit)),
         bins=list(_bins(fit)),
         numbers=list(_numbers(fit)),
@@ -66,26 +66,26 @@ def page(fit: Fit, tally: BesideCounts, noise_mps2: float, asked: FitRequest, ot
         others=others,
         base=BASE,
     )
-    return printable(shown)
+    return printable(html)
 
 
 def _numbers(fit: Fit) -> Iterator[tuple[str | bool, ...]]:
-    """Name, value, standard error, the base's value, distance from it in standard errors, whether data are silent."""
-    base, found = fit.base.values(), fit.environment.numbers()
-    for path, each in found.items():
-        if each.se is None or path.startswith(("hazard_table", "acceptance_steps")):
+    """Name, value, standard error, the base's value, distance from it in standard errors, whether it is unknown."""
+    base, fitted = fit.base.values(), fit.environment.numbers()
+    for path, entry in fitted.items():
+        if entry.se is None or path.startswith(("hazard_table", "acceptance_steps")):
             continue
-        was = base[path]
-        away = (each.value - was) / each.se if each.se > 0.0 else math.nan
-        values = number(each.value), number(each.se, 2), number(was), f"{away:+.1f}"
-        yield (path.replace("__", "."), *values, each.se > max(abs(each.value), abs(was)))
+        base_value = base[path]
+        away = (entry.value - base_value) / entry.se if entry.se > 0.0 else math.nan
+        values = number(entry.value), number(entry.se, 2), number(base_value), f"{away:+.1f}"
+        yield (path.replace("__", "."), *values, entry.se > max(abs(entry.value), abs(base_value)))
 
 
 def _bins(fit: Fit) -> Iterator[tuple[str, int, str, str, str]]:
-    """Time to collision, lane changes seen and expected, their ratio and its limits by bin."""
-    found = fit.acceptance
-    low, high = _limits(found.events, found.exposure)
-    for name, events, *row in zip(BIN_NAMES, found.events, found.exposure, found.shares, low, high, strict=True):
+    """Per bin of time to collision: its name, lane changes seen and expected, their ratio, and its limits."""
+    steps = fit.acceptance
+    low, high = _limits(steps.events, steps.exposure)
+    for name, events, *row in zip(BIN_NAMES, steps.events, steps.exposure, steps.shares, low, high, strict=True):
         exposure, *shares = (number(float(each), 2) for each in row)
         yield name, int(events), exposure, shares[0], " to ".join(shares[1:])
 
@@ -103,8 +103,8 @@ def _plots(fit: Fit) -> Iterator[Plot]:
     traffic = load_environment(EnvironmentSettings(), fit.environment)
     if fit.traffic.initial.size:
         yield _initial_plot(fit, traffic)
-    both = [(fit.traffic.free, "Free driving"), (fit.traffic.following, "Behind a leader")]
-    panels = [_acceleration_panel(rows, title, traffic) for rows, title in both if rows.size]
+    accelerations = [(fit.traffic.free, "Free driving"), (fit.traffic.following, "Behind a leader")]
+    panels = [_acceleration_panel(rows, title, traffic) for rows, title in accelerations if rows.size]
     if panels:
         caption = "The law draws every second independently; real drivers persist, so that simulated ones are steadier."
         yield Plot("accelerations", panels, "Accelerations seen and by the law.", caption)
@@ -125,11 +125,12 @@ def _beside(
     law: tuple[FloatArray, FloatArray],
     words: tuple[str, str] = ("seen", "law"),
 ) -> PlotPanel:
-    """A histogram (n,) between edges (n + 1,), and points of the law's line."""
-    panel, (at, line) = PlotPanel(title, PlotAxis(label, float(edges[0]), float(edges[-1])), y), law
+    """A histogram ``seen`` (n,) between edges (n + 1,), and the line of a ``law``: points on the axis, and values."""
+    panel = PlotPanel(title, PlotAxis(label, float(edges[0]), float(edges[-1])), y)
+    points, line = law
     low = np.full(seen.size, y.low)
     panel.add("boxes", "blue", edges[:-1], edges[1:], low, np.maximum(seen, low), opacity=0.3, label=words[0])
-    panel.add("line", "vermillion", at, np.maximum(line, y.low), label=words[1])
+    panel.add("line", "vermillion", points, np.maximum(line, y.low), label=words[1])
     return panel
 
 
@@ -144,13 +145,13 @@ def _density(*curves: FloatArray) -> PlotAxis:
 
 
 def _acceptance_plot(fit: Fit) -> Plot:
-    found, edges = fit.acceptance, np.array([0.0, *TTC_EDGES_S, 12.0])
+    acceptance, edges = fit.acceptance, np.array([0.0, *TTC_EDGES_S, 12.0])
     y = PlotAxis("share carried out", 1e-3, 3.0, log=True)
     panel = PlotPanel("", PlotAxis("time to collision, s", 0.0, 12.0), y, height=280.0)
-    limits = _limits(found.events, found.exposure)
+    limits = _limits(acceptance.events, acceptance.exposure)
     _add_limits(panel, edges, *limits, f"{numbers.share(CONFIDENCE)} limits by bin")
     steps = np.repeat(edges, 2)[1:-1]
-    panel.add("line", "blue", steps, np.repeat(found.shares, 2), label="fitted")
+    panel.add("line", "blue", steps, np.repeat(acceptance.shares, 2), label="fitted")
     times = np.linspace(0.05, 12.0, 240)
     for name, colour in SHIPPED.items():
         n = read_model(SHIPPED_FOLDER / f"{name}.yaml", EnvironmentParameters).values()
@@ -172,12 +173,12 @@ def _hazard_plot(fit: Fit) -> Plot:
     for column, label in zip(HAZARD_OF, labels, strict=True):
         edges = np.unique(np.quantile(rows[column], np.linspace(0.0, 1.0, 9)))
         edges = edges if edges.size > 1 else edges[0] + np.array([-0.5, 0.5])
-        at = np.clip(np.searchsorted(edges, rows[column], side="right") - 1, 0, edges.size - 2)
+        bin_of_row = np.clip(np.searchsorted(edges, rows[column], side="right") - 1, 0, edges.size - 2)
         seen, time_s, wished, middle = (
-            np.bincount(at, weights, edges.size - 1).astype(np.float64)
+            np.bincount(bin_of_row, weights, edges.size - 1).astype(np.float64)
             for weights in (rows["changes"], rows["duration_s"], rate * rows["duration_s"], rows[column])
         )
-        middle /= np.maximum(np.bincount(at, minlength=edges.size - 1), 1)
+        middle /= np.maximum(np.bincount(bin_of_row, minlength=edges.size - 1), 1)
         per_1000_s = np.maximum(time_s, 1e-9) / 1000.0
         low, high = _limits(seen, per_1000_s)
         top = 1.1 * float(max(high.max(), (wished / per_1000_s).max()))
@@ -198,11 +199,11 @@ def _initial_plot(fit: Fit, traffic: Environment) -> Plot:
     labels = {"v_mps": "speed of BV, m/s", "r1_m": "gap R1 to LV, m", "r1dot_mps": "R1dot, m/s"}
     panels = []
     for column, label in labels.items():
-        of = "v_bv_mps" if column == "v_mps" else column
+        state_column = "v_bv_mps" if column == "v_mps" else column
         low, high = np.quantile(rows[column], [0.002, 0.998])
         low, high = (low, high) if low < high else (low - 0.5, high + 0.5)
         edges = np.linspace(low, high, 31)
-        seen, law = _histogram(rows[column], edges), _histogram(drawn[of], edges)
+        seen, law = _histogram(rows[column], edges), _histogram(drawn[state_column], edges)
         line = 0.5 * (edges[1:] + edges[:-1]), law
         panels.append(_beside("", label, _density(seen, law), edges, seen, line))
     alt = "Histograms of observed initial states, and the law's densities."
@@ -211,9 +212,9 @@ def _initial_plot(fit: Fit, traffic: Environment) -> Plot:
 
 def _acceleration_panel(rows: RecordArray, title: str, traffic: Environment) -> PlotPanel:
     step = -(-rows.size // MOST_ROWS)
-    some = rows[::step]
+    sample = rows[::step]
     names = rows.dtype.names or ()
-    states = np.column_stack([some[name] if name in names else np.zeros(some.size) for name in HAZARD_OF])
+    states = np.column_stack([sample[name] if name in names else np.zeros(sample.size) for name in HAZARD_OF])
     pmf = evaluate_laws(traffic, states).pmf[CAR_FOLLOWING if "r1_m" in names else FREE_DRIVING]
     law, seen = pmf.mean(axis=0), np.bincount(bins(rows["acceleration_mps2"]), minlength=N_ACCELERATIONS) / rows.size
     y = PlotAxis("share", 10.0 ** math.floor(math.log10(min(1.0 / rows.size, 0.1))), 1.0, log=True)
