@@ -100,6 +100,7 @@ def build_pool(resolved: Resolved, key: str, progress: Progress | None = None, o
     n = planned_number(aim, resolved.campaign.pool.relative_error or resolved.family.pool_error)
     progress.stage(f"pool of {resolved.family.words.events}", n)
     paths = aim.enumerator.run(PILOT_PATHS, n, progress)
+    progress.stage("pool: events that are kept", None)
     places = np.array([names.index(name) for name in order], np.int64) if order else None
     return pool_of(resolved, paths, key, places)
 
