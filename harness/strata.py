@@ -59,13 +59,14 @@ class Assumed:
 
     Either the ``share`` of drivers who do not look, stated up to ``highest``; or the rate of lane changes at times to
     collision ``where`` none was seen. ``times`` (2, S) are factors of the probabilities at the two ends of what it may
-    be; None where no strata are known.
+    be, and ``reference_times`` of the first reference driver's rate; None where no strata are known.
     """
 
     where: str = ""
     highest: float | None = None
     times: tuple[tuple[float, ...], tuple[float, ...]] | None = None
     share: float | None = None
+    reference_times: tuple[float, float] | None = None
 
 
 @dataclass(frozen=True, eq=False)

@@ -33,12 +33,16 @@ CARRIES = 0.05
 
 @dataclass(frozen=True)
 class AssumedOfRate:
-    """What is assumed of the traffic, see `Assumed`; ``times`` are the factors of the rate at both ends."""
+    """What is assumed of the traffic, see `Assumed`.
+
+    ``times`` are the factors of the rate at both ends, ``ratio_times`` those of its ratio to the reference driver.
+    """
 
     where: str
     highest: float | None
     times: tuple[float, float] | None
     share: float | None = None
+    ratio_times: tuple[float, float] | None = None
 
     @property
     def most(self) -> float:
@@ -143,14 +147,16 @@ def estimate_blocks(
 
 def _of_rate(assumed: Assumed, best: Estimate) -> AssumedOfRate:
     """The factors by which the rate moves over what is assumed; without a crash, those of its upper limit."""
-    times, shells = None, best.details.get("shells")
+    times, of_ratio, shells = None, None, best.details.get("shells")
     if assumed.times is not None and shells:
         p, n, share = np.array([(shell["p"], shell["n_episodes"], shell["crash_share"]) for shell in shells]).T
         masses = p * np.vstack([np.ones_like(p), *map(np.array, assumed.times)])
         # Without a crash the upper limit comes from one stratum: that in which a crash would weigh most.
         rates = masses @ share if best.n_crashes else weight_of_a_test(masses, n.astype(np.int64)).max(1)
         times = float(rates[1] / rates[0]), float(rates[2] / rates[0])
-    return AssumedOfRate(assumed.where, assumed.highest, times, assumed.share)
+        if best.n_crashes and assumed.reference_times is not None:
+            of_ratio = times[0] / assumed.reference_times[0], times[1] / assumed.reference_times[1]
+    return AssumedOfRate(assumed.where, assumed.highest, times, assumed.share, of_ratio)
 
 
 def before_event(campaign: Campaign, manifest: Mapping[str, Any], counts: Mapping[str, int]) -> dict[str, Any]:

@@ -147,7 +147,9 @@ def assumed(
     paths = FewPaths(traffic, pool, design, tested_limit(traffic.campaign), progress)
     base, *at_ends = paths.of([traffic.environment, *filter(None, ends)])
     low, high = (tuple(ratio_of(end.p, base.p).tolist()) for end in at_ends)
-    return asdict(Assumed(left_open.where, left_open.highest, (low, high), left_open.share))
+    crashes = np.flatnonzero(base.references)[:1]  # the first that does
+    lower, upper = (float(ratio_of(end.references, base.references)[crashes].sum()) or 1.0 for end in at_ends)
+    return asdict(Assumed(left_open.where, left_open.highest, (low, high), left_open.share, (lower, upper)))
 
 
 def ratio_of(a: FloatArray, b: FloatArray, *, of_nothing: float = 1.0) -> FloatArray:

@@ -30,6 +30,8 @@ from harness.strata import ASSUMPTION_FREE
 from harness.vehicles.kinematics import STEP_S
 
 EARLY = "n_crashes_before_event"
+MOVES = 1.25
+"""Factor from which it is said by how much assumed numbers move a ratio."""
 CUT_OFF_SHARE = 0.2
 """Weight, relative to the rate, from which tests that were cut off are warned of, if the interval leaves them out."""
 ENDED = {
@@ -195,6 +197,7 @@ def _warnings(campaign: Campaign, manifest: Mapping[str, Any], estimates: Estima
     if assumed is not None and assumed.where and assumed.times is None:
         yield unseen_words(assumed.where)
     yield from runs_warning(estimates.decision)
+    yield from _ratio_warning(estimates)
     on_rate = estimates.decision is not None and not estimates.decision.get("driver")
     if on_rate and assumed is not None and assumed.no_lower_limit:
         yield f"no lane change was seen at {assumed.where}: a limit on the rate rests on that; use --accept r157-cc"
@@ -202,6 +205,25 @@ def _warnings(campaign: Campaign, manifest: Mapping[str, Any], estimates: Estima
         yield f"lane_change_level is {plain(level)}: compare only with rates at the same level"
     if traffic is not None:
         yield from too_few(traffic.n_replicates, traffic.confidence)
+
+
+def _ratio_warning(estimates: Estimates) -> Iterator[str]:
+    """That the ratio to the reference driver, too, moves with how many drivers do not look behind."""
+    assumed, decision = estimates.assumed, estimates.decision
+    references = [each for each in estimates.best.details.get("references", ()) if each["crash_rate"] > 0.0][:1]
+    if assumed is None or assumed.ratio_times is None or assumed.highest is None or not references:
+        return
+    low, high = min(assumed.ratio_times), max(assumed.ratio_times)
+    if max(high, 1.0 / max(low, 1e-9)) < MOVES:
+        return
+    turns = False
+    if decision is not None and decision.get("driver") and decision["verdict"] != "undecided":
+        ratio_now, accepted = references[0]["ratio"], decision["verdict"] == "accepted"
+        turns = ratio_now * high >= decision["limit"] if accepted else ratio_now * low <= decision["limit"]
+    ends = f"× {number(low, 2)} to × {number(high, 2)}"
+    yield f"over the assumed range of drivers who do not look the ratio moves, too: {ends}" + (
+        ", which may turn the verdict" * turns
+    )
 
 
 def runs_warning(decision: Mapping[str, Any] | None) -> Iterator[str]:

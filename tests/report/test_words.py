@@ -155,6 +155,29 @@ def test_an_end_that_says_nothing_is_not_shown(stored_run, verdict, untested):
     assert found["impact"][1:] == ("", "0 % (0–41 %) below 1 m/s")
 
 
+@pytest.mark.parametrize(
+    ("times", "verdict", "said_of_it"),
+    [
+        ((0.9, 1.2), "accepted", None),
+        ((3.0, 0.8), None, "× 0.80 to × 3.0"),
+        ((3.0, 0.8), "accepted", "× 0.80 to × 3.0, which may turn the verdict"),
+        ((1.5, 0.8), "accepted", "× 0.80 to × 1.5"),
+        ((0.2, 1.3), "rejected", "× 0.20 to × 1.3"),
+    ],
+)
+def test_a_ratio_that_moves_with_who_does_not_look_is_warned_of(times, verdict, said_of_it, stored_run):
+    """Of a vehicle with half the reference driver's rate, and a limit of once that."""
+    run = read_run_folder(stored_run("shells-accepted"))
+    details = run.estimates.best.details
+    beside = {**details["references"][0], "ratio": 0.5 if verdict == "accepted" else 9.0}
+    best = replace(run.estimates.best, details={**details, "references": [beside]})
+    decision = verdict and {**run.manifest["decision"], "verdict": verdict, "driver": "r157-cc", "limit": 1.0}
+    others = AssumedOfRate("", 0.25, (0.1, 25.0), 0.01, times)
+    warnings = said(run, best, decision=decision, assumed=others).warnings
+    found = [text.rpartition("too: ")[2] for text in warnings if "drivers who do not look" in text]
+    assert found == ([] if said_of_it is None else [said_of_it])
+
+
 @pytest.mark.parametrize(("cut_off", "high", "warned"), [(0.19, 1.1, False), (0.3, 1.2, True), (0.3, 1.4, False)])
 def test_tests_whose_time_was_up_are_warned_of_where_the_interval_leaves_them_out(cut_off, high, warned, stored_run):
     """They are many, and had they crashed the rate would be above its upper end."""

@@ -137,11 +137,11 @@ def test_where_no_lane_change_was_seen_there_is_an_upper_limit_alone(stored_run,
 
 
 @pytest.mark.slow
-def test_who_may_look_less_is_a_line_of_its_own(stored_run, tmp_path):
+def test_who_may_look_less_is_a_line_of_its_own(folder, tmp_path):
     """The rate is in proportion to the share that does not look, in its range; without a crash its limit is."""
     text = SHIPPED.replace("{value: 0.01, source: assumed}", "{value: 0.01, source: assumed, range: [0.005, 0.08]}")
     (tmp_path / "mine.yaml").write_text(text)
-    tested = StoredShells.of(stored_run("shells-twin"), Progress())
+    tested = StoredShells.of(folder, Progress())
     there = resolve(tested.here.campaign.replaced(("environment", "parameters"), str(tmp_path / "mine.yaml")))
     found = assumed(there, tested.pool, tested.design, Progress())
     assert (found["where"], found["share"], found["highest"]) == ("", 0.01, 0.08)
@@ -149,6 +149,10 @@ def test_who_may_look_less_is_a_line_of_its_own(stored_run, tmp_path):
     (row,) = [row for row in told(content)["rows"] if row["key"] == "assumed"]
     assert (row["value"], row["remark"]) == ("up to 8.0 times", "if 8 %, not 1 %, do not look behind")
     assert content["assumed"]["times"] == pytest.approx([0.5, 8.0], rel=0.005)
+    assert content["assumed"]["ratio_times"] == pytest.approx([1.0, 1.0], rel=0.005)
+    moved = sensitivity(folder, ranges={"cut_in.ignore_share": (0.005, 0.08)})
+    (bar,) = (bar for bar in moved["bars"] if bar["what"] == "cut_in.ignore_share")
+    assert content["assumed"]["ratio_times"] == pytest.approx(bar["ratio"], rel=1e-9)
     assert assumed(tested.here, tested.pool, tested.design, Progress()) is None
 
 
