@@ -157,8 +157,7 @@ class SeenShells:
     def add(self, block: Block) -> None:
         """Count one block."""
         design, crash = block.drawn.shells, block.crash
-        if design is None:
-            raise ValueError("the block has no shells")
+        assert design is not None
         if not self.cells.tests.size:
             self.design, self.cells = design, empty_tally(design.cell_p.size)
         tally, cell, stratum = self.cells, block.cell, block.stratum
