@@ -2,14 +2,14 @@
 
 Bit-exactness rests on three choices made here. No fast-math and no fused operations, so that SUMO's C++ arithmetic can
 be matched. No short-vector math library, whose `exp` and `log` differ from the scalar ones depending on how a loop was
-vectorised. And a cache of our own under a hash of *all* sources of compiled code: numba's own, also where
-``NUMBA_CACHE_DIR`` says, looks only at the file that a function stands in, and would keep a caller compiled with
-yesterday's callee; it runs what it finds, damaged or not; and where it cannot write it takes another place, whatever
-lies there, or refuses the function. A function is known by its module, so that the same sources are compiled once,
-wherever they are installed.
+vectorised. And a cache of our own under a hash of *all* sources of compiled code. Numba's own cache (also that of
+``NUMBA_CACHE_DIR``) looks only at the file that a function stands in, and would keep a caller compiled with an old
+callee. It runs what it finds, damaged or not. Where it cannot write it takes another place, whatever lies there, or
+refuses the function. Ours knows a function by its module, so that the same sources are compiled once, wherever they are
+installed.
 
-Our own hangs on what numba does not document: a kernel's ``_cache`` and what passes through it, a ``CompileResult``
-that is taken apart and put together, ``serialize.dumps``. It was tried with numba 0.62.0, 0.65.1 and 0.68.1.
+It relies on what numba does not document: a kernel's ``_cache`` and what passes through it, a ``CompileResult`` that is
+taken apart and put together, ``serialize.dumps``. It was tried with numba 0.62.0, 0.65.1 and 0.68.1.
 """
 
 from __future__ import annotations
@@ -45,15 +45,15 @@ WORLD_SOURCES = (
 )
 """Files that decide what happens in a test, but for `NO_SOURCES`; pools and tables are made again when one changes."""
 NO_SOURCES = "words.py", "fitting", "fitting.py"
-"""Files and folders of families that change no test."""
+"""Files and folders of families that do not change any test."""
 KERNEL_SOURCES = (*WORLD_SOURCES, "estimators/likelihood.py")
 """All files that compiled code may come from, or take constants from (a test holds this against the imports)."""
 
 
 def source_files(patterns: tuple[str, ...]) -> list[Path]:
-    """Files that patterns name."""
-    found = {path for pattern in patterns for path in _PACKAGE.glob(pattern)}
-    return sorted(path for path in found if not set(NO_SOURCES).intersection(path.relative_to(_PACKAGE).parts))
+    """Files of some patterns, but for `NO_SOURCES`."""
+    files = {path for pattern in patterns for path in _PACKAGE.glob(pattern)}
+    return sorted(path for path in files if not set(NO_SOURCES).intersection(path.relative_to(_PACKAGE).parts))
 
 
 def source_hash(patterns: tuple[str, ...] = KERNEL_SOURCES) -> str:
@@ -91,11 +91,11 @@ KERNELS = f"kernels-{source_hash()}-{sys.implementation.cache_tag}-numba-{versio
 
 
 _COMPILES_S = 60.0
-"""Longer than any kernel takes [assumed]: what another process has not compiled by then is compiled here, too."""
+"""Longer than any kernel takes [assumed]: then what another process has begun is compiled here, too."""
 
 
 class _KernelCache(caching.NullCache):
-    """Where numba finds what has been compiled of a kernel, and leaves what has not."""
+    """Numba's cache of a kernel: finds and keeps its compiled code."""
 
     def __init__(self, function: Callable[..., object]) -> None:
         self._name = f"{KERNELS}/{function.__module__}.{function.__qualname__}-"
@@ -110,19 +110,19 @@ class _KernelCache(caching.NullCache):
         return self._name + hashlib.sha256(content).hexdigest()[:24]
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
-        """What has been compiled for these types and this processor; None if nothing has: others wait for it then."""
+        """Code compiled for these types and this processor; None if there is none: others then wait for ours."""
         target_context.refresh()
-        self._compiling.close()  # of one that was not compiled in the end
+        self._compiling.close()  # left open by a compilation that failed
         name = self._name_for(sig, target_context.codegen())
-        if (kept := cache.read(name)) is None:
+        if (stored := cache.read(name)) is None:
             self._compiling.enter_context(cache.made_once(name, lambda _: None, most_s=_COMPILES_S))
-            if (kept := cache.read(name)) is None:
+            if (stored := cache.read(name)) is None:
                 return None
             self._compiling.close()
-        return compiler.CompileResult._rebuild(target_context, *pickle.loads(kept))  # type: ignore[no-untyped-call] # noqa: S301 - sound, and our own
+        return compiler.CompileResult._rebuild(target_context, *pickle.loads(stored))  # type: ignore[no-untyped-call] # noqa: S301 - sound, and our own
 
     def save_overload(self, sig: Any, data: Any) -> None:
-        """Keep what has been compiled, unless it holds addresses."""
+        """Keep compiled code, unless it holds addresses."""
         with self._compiling:
             if not data.library.has_dynamic_globals:
                 name = self._name_for(sig, data.codegen)
@@ -153,7 +153,7 @@ def compiled(function: _Function) -> _Function:
 
 
 def compiled_inline(function: _Function) -> _Function:
-    """Let kernels inline a small function; elsewhere it is what it is, a function of Python."""
+    """Let kernels inline a small function; elsewhere it stays a function of Python."""
     result: _Function = _extending.register_jitable(forceinline=True, **_SETTINGS)(function)
     return result
 
@@ -168,12 +168,12 @@ def is_cached(kernel: Callable[..., object]) -> bool:
     return cast("_KernelCache", cast("Any", kernel)._cache).is_filled
 
 
-# -- named tuples that kernels are given as one pointer, because they have been taken apart before --
+# -- named tuples as one pointer --
 #
-# A kernel that is called with named tuples of fifty arrays spends more time on reading Python's objects than on 96
-# cells. Here that is done once: the tuple is laid out in memory that Python keeps, word by word. In kernels the fields
-# of an `unboxed` tuple are read like those of the tuple itself; a tuple within it is a pointer again, so that parts of
-# kernels hand on one number each, and are compiled once whoever calls them.
+# A kernel that is called with named tuples of fifty arrays spends more time on unpacking Python's objects than on 96
+# cells. Here they are unpacked once: the tuple is laid out in memory that Python keeps, word by word. In kernels the
+# fields of an `unboxed` tuple are read like those of the tuple itself. A tuple within it is a pointer again, so that
+# functions within kernels hand on one number each, and are compiled once whoever calls them.
 
 _Bundle = TypeVar("_Bundle", bound=tuple[Any, ...])
 _numba: Any = numba
@@ -207,7 +207,7 @@ _TYPES: dict[Any, _UnboxedType] = {}
 
 
 def _kind(value: Any) -> Any:
-    """What numba's type of a value follows from."""
+    """Key of numba's type of a value."""
     if isinstance(value, tuple):
         return type(value), *map(_kind, value)
     if isinstance(value, np.ndarray):
@@ -278,19 +278,19 @@ def _read_field(context: Any, builder: Any, kind: _UnboxedType, value: Any, name
     return _load(builder, pointer, context.get_value_type(field), owned=isinstance(field, types.Array))
 
 
-def _load(builder: Any, pointer: Any, what: Any, *, owned: bool = False) -> Any:
-    """Load a value leaf by leaf: while a kernel runs nobody writes there, which the compiler is told of each leaf.
+def _load(builder: Any, pointer: Any, kind: Any, *, owned: bool = False) -> Any:
+    """Load a value leaf by leaf, each marked as constant: nobody writes there while a kernel runs.
 
-    What is ``owned``, an array, gets owner and parent that the compiler knows to be none: so no reference is counted.
+    An ``owned`` value, an array, gets no owner and parent, which the compiler then knows: it counts no references.
     """
-    if not isinstance(what, ir.Aggregate):
-        leaf = builder.load(builder.bitcast(pointer, what.as_pointer()))
+    if not isinstance(kind, ir.Aggregate):
+        leaf = builder.load(builder.bitcast(pointer, kind.as_pointer()))
         leaf.set_metadata("invariant.load", builder.module.add_metadata([]))
         return leaf
-    words, value = builder.bitcast(pointer, what.as_pointer()), ir.Constant(what, ir.Undefined)
-    for i, part in enumerate(what.elements):
-        at = builder.gep(words, [ir.IntType(32)(0), ir.IntType(32)(i)], inbounds=True)
-        value = builder.insert_value(value, part(None) if owned and i < 2 else _load(builder, at, part), i)
+    words, value = builder.bitcast(pointer, kind.as_pointer()), ir.Constant(kind, ir.Undefined)
+    for i, part in enumerate(kind.elements):
+        element = builder.gep(words, [ir.IntType(32)(0), ir.IntType(32)(i)], inbounds=True)
+        value = builder.insert_value(value, part(None) if owned and i < 2 else _load(builder, element, part), i)
     return value
 
 

@@ -1,6 +1,6 @@
 """exp, log, log1p and expm1 of arrays, by the C library: numpy's own have other last digits on CPUs with AVX-512.
 
-What decides which tests are driven, and how, comes from these, so that it is the same bits on other processors, too.
+Whatever decides which tests are driven, and how, is computed by these, so that bits are the same on all processors.
 """
 
 from __future__ import annotations

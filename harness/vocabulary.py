@@ -32,9 +32,9 @@ def read_only(array: NDArray[_Scalar]) -> NDArray[_Scalar]:
 Method = Literal["nde", "forced", "step_mixture", "episode_mixture", "shells"]
 EstimatorName = Literal["nde", "nade", "mixture_cv", "dr", "scv", "shells"]
 StoppedBy = Literal["rhw", "below_reference", "accept", "episodes", "pool", "pool_error", "sum"]
-"""The asked precision, a rate far enough below a reference driver's, a decision about the limit, the budget, the last
-event that the pool holds of a shell that needs more, or the pool's own error, which alone is wider than that; of one of
-several scenarios that their sum had ended."""
+"""In this order: the asked precision; a rate far enough below a reference driver's; a decision about the limit; the
+budget; the last event that the pool holds of a shell that needs more; the pool's own error, if it alone is wider than
+the asked precision; for one of several scenarios, that their sum had ended."""
 
 METHODS: tuple[Method, ...] = get_args(Method)
 ESTIMATORS: tuple[EstimatorName, ...] = get_args(EstimatorName)
@@ -44,8 +44,8 @@ ESTIMATORS: tuple[EstimatorName, ...] = get_args(EstimatorName)
 class Sampling:
     """One method of drawing tests.
 
-    ``estimators`` are those that its records allow, the first being the method's own, which answers the campaign's
-    question; `scv` needs control steps on record besides, `dr` 1,000 tests.
+    ``estimators`` are those that its records allow; the first is the method's own, the headline. `scv` also needs
+    recorded control steps, `dr` 1,000 tests.
     """
 
     estimators: tuple[EstimatorName, ...]
@@ -65,7 +65,7 @@ class Sampling:
 
     @property
     def mixes(self) -> bool:
-        """Whether it needs surrogates, and their challenge tables."""
+        """Whether it needs challenge tables of surrogates."""
         return self.mixes_steps or self.mixes_episodes
 
 
@@ -78,9 +78,9 @@ SAMPLING: dict[Method, Sampling] = {
 }
 
 MOST_ASKED = 100_000
-"""Of workers, of tests of a check, of replicates: more is a slip of the hand that no memory holds."""
+"""Most workers, tests of a check, or replicates: more is a slip of the hand, for which there is no memory."""
 COMPARISON, FAMILIES = "compare.json", "families.json"
-"""By these files a folder is that of a comparison, or of several scenarios, and not of a run."""
+"""Files that mark the folder of a comparison, or of several scenarios, as no folder of a run."""
 
 OUTCOMES = ("crash", "passed", "timeout", "bv_lv_contact", "failed")
 CRASH, PASSED, TIMEOUT, CONTACT, FAILED = range(len(OUTCOMES))

@@ -20,19 +20,19 @@ if TYPE_CHECKING:
     from harness.families.protocol import Family
 
 R157 = ("cut_in", "lead_brakes", "cut_out")
-"""Those of UN Regulation No. 157."""
+"""Scenarios of UN Regulation No. 157."""
 GROUP = "harness.families"
 
 
 @cache
 def families() -> dict[str, Family]:
-    """All that are installed, by name."""
+    """All installed families by name."""
     from harness.families.cut_in.family import CUT_IN  # noqa: PLC0415 - families are read when one is asked for
     from harness.families.cut_out.family import CUT_OUT  # noqa: PLC0415
     from harness.families.lead_brakes.family import LEAD_BRAKES  # noqa: PLC0415
 
-    own: tuple[Family, ...] = CUT_IN, LEAD_BRAKES, CUT_OUT
-    return {each.name: each.load() for each in entry_points(group=GROUP)} | {each.name: each for each in own}
+    shipped: tuple[Family, ...] = CUT_IN, LEAD_BRAKES, CUT_OUT
+    return {each.name: each.load() for each in entry_points(group=GROUP)} | {each.name: each for each in shipped}
 
 
 def family_named(name: str, where: str = "scenario", more: Sequence[str] = ()) -> Family:
@@ -40,13 +40,13 @@ def family_named(name: str, where: str = "scenario", more: Sequence[str] = ()) -
 
     Raises `CampaignError`: none has that name.
     """
-    known = families()
-    if name not in known:
-        names = [*known, *more]
+    installed = families()
+    if name not in installed:
+        names = [*installed, *more]
         mend = did_you_mean(name, names) or "Write one of them, or install the package that brings it."
         if where.startswith("--") and "?" in mend:
-            mend = f"Write {re.sub(r'[^ =,]+', lambda each: nearest(each[0], names) or each[0], where)}."
+            mend = f"Write {re.sub(r'[^ =,]+', lambda word: nearest(word[0], names) or word[0], where)}."
         elif name == "all":
             mend = f"Write scenarios: [{', '.join(R157)}], or --scenario all."
         raise CampaignError(where, f"'{name}'", f"a kind of events: {listed(names)}", mend)
-    return known[name]
+    return installed[name]

@@ -11,7 +11,7 @@ from harness.vocabulary import BoolArray, FloatArray, Record
 
 _SPEED_POINTS = 8001
 PROBABILITIES = np.array([2.0**-53, 1e-6, 1e-3, 0.01, 0.1, 0.5, 0.9, 0.99, 0.999, 1.0 - 1e-6, 1.0 - 2.0**-53])
-"""Where quantiles are evaluated: the ends are the smallest and the largest uniform that is drawn, but zero."""
+"""Where quantiles are evaluated; the ends are the smallest uniform above zero, and the largest, that can be drawn."""
 
 
 class Flow:
@@ -30,7 +30,7 @@ class Flow:
             self.speed_cdf: FloatArray = (cdf - cdf[0]) / (cdf[-1] - cdf[0])
 
     def u_of(self, v: FloatArray) -> FloatArray:
-        """Speeds (m/s) as fits have them."""
+        """Scaled speeds u of the fits, from speeds (m/s)."""
         return np.asarray((v - self._n["fit_range__v_centre_mps"]) / self._n["fit_range__v_scale_mps"])
 
     def speeds(self, probability: FloatArray) -> FloatArray:
@@ -50,7 +50,7 @@ class Flow:
         return np.asarray(shift + elementary.exp(mean + sd * special.ndtri(below + probability * (upto - below))))
 
     def require_sound(self, file: str) -> None:
-        """Refuse laws (`CampaignError`, naming a parameter ``file``) of which nothing is left in the fit range."""
+        """Refuse laws that give no values within the fit range (`CampaignError`, naming the parameter ``file``)."""
         reaches = np.diff(self.speed_cdf) >= -1e-9  # rounding shows where next to nothing of the distribution is left
         where = f"initial_state.v_location_mps, v_scale_mps and v_shape ({file})"
         require(reaches, where, "no speed within the fit range", (), "a distribution of v_BV that reaches into it")

@@ -54,7 +54,7 @@ def within(low: float, high: float) -> AfterValidator:
     return AfterValidator(checked)
 
 
-# Wide limits: what a law makes of its numbers is judged where it is loaded.
+# Wide limits: whether a law is sound with its numbers is checked when it is loaded.
 Coefficient = Annotated[Number, within(-1000.0, 1000.0)]
 LogScale = Annotated[Number, within(-50.0, 50.0)]
 Scale = Annotated[Number, within(0.001, 1000.0)]
@@ -123,9 +123,9 @@ class SpeedsAndGaps(Section):
 
 
 class LeftOpen(NamedTuple):
-    """What data leave open of a traffic: numbers by name at the two ``ends`` of what they may be.
+    """What data leave open of a traffic: numbers by name, at the two ``ends`` of what they may be.
 
-    ``where`` says where nothing was seen, else it is empty and ``highest`` the end of what is stated of a ``share``.
+    Either ``where`` says where no event was seen, or a ``share`` is stated with a range that ends at ``highest``.
     """
 
     where: str
@@ -138,8 +138,8 @@ class ParameterFile(Section):
     """Numbers of a traffic in sections, each with its provenance; a file may be ``like`` one of a ``folder``.
 
     ``replicates`` names a ``file`` of numbers that other data would have given, with its ``sha256``; None without one.
-    ``blocks`` are sections whose numbers are fitted together, by what they are called. Of one whose data have all kinds
-    of events nothing more is to be said.
+    ``blocks`` are sections whose numbers are fitted together, by a name of them all. A family whose data may lack some
+    kinds of events overrides `kinds` and `left_open`.
     """
 
     folder: ClassVar[Path]
@@ -148,39 +148,39 @@ class ParameterFile(Section):
 
     @model_validator(mode="before")
     @classmethod
-    def _is_like_another(cls, given: Any) -> Any:
-        return completed(given, cls.folder) if isinstance(given, dict) else given
+    def _is_like_another(cls, content: Any) -> Any:
+        return completed(content, cls.folder) if isinstance(content, dict) else content
 
     @property
     def kinds(self) -> Any:
-        """Kinds of events of which data may have none (`harness.families.cut_in.sections.AcceptanceSteps`), or None."""
+        """Kinds of events that data may lack, as `harness.families.cut_in.sections.AcceptanceSteps`; None for none."""
         return None
 
     @property
     def unseen(self) -> str:
-        """Where the data had no event; empty where they had."""
+        """Where the data had no event; empty if they had events everywhere."""
         return "" if (kinds := self.kinds) is None else kinds.where(kinds.without_events)
 
     def left_open(self) -> LeftOpen | None:
-        """What data leave open."""
+        """Numbers that the data do not determine; None if there are none."""
         return None
 
     def numbers(self) -> dict[str, Number]:
-        """Flat ``section__name``, of those in a list ``section__name__0`` and so on → number, with its provenance."""
-        found: dict[str, Any] = {}
-        for section, of in self:
-            for name, entry in of if isinstance(of, Section) else ():
-                found[f"{section}__{name}"] = entry
-                listed = enumerate(entry if isinstance(entry, list) else ())
-                found |= {f"{section}__{name}__{i}": each for i, each in listed}
-        return {name: entry for name, entry in found.items() if isinstance(entry, Number)}
+        """Numbers with their provenance by ``section__name``, those of a list by ``section__name__0`` and so on."""
+        flat: dict[str, Any] = {}
+        for name, section in self:
+            for key, entry in section if isinstance(section, Section) else ():
+                flat[f"{name}__{key}"] = entry
+                items = entry if isinstance(entry, list) else ()
+                flat |= {f"{name}__{key}__{i}": item for i, item in enumerate(items)}
+        return {name: entry for name, entry in flat.items() if isinstance(entry, Number)}
 
     def values(self) -> dict[str, float]:
         """The same without provenance."""
         return {name: number.value for name, number in self.numbers().items()}
 
     def with_values(self, values: Mapping[str, float]) -> Self:
-        """Other values by their flat names, as of a row of replicates; a `ValueError` where one is not allowed."""
+        """The same with other values by their flat names; a `ValueError` where one is not allowed."""
         content = self.model_dump()
         for name, value in values.items():
             place: Any = content
@@ -199,16 +199,16 @@ def _shipped(file: Path) -> dict[str, Any]:
     return completed(read_yaml(file)[0], file.parent)
 
 
-def completed(given: dict[str, Any], folder: Path) -> dict[str, Any]:
-    """What a file says, with numbers and sections that it leaves out as in the shipped one that it is ``like``."""
-    if "like" not in given:
-        return given
+def completed(content: dict[str, Any], folder: Path) -> dict[str, Any]:
+    """The content of a file; what it leaves out is taken from the shipped file that it is ``like``."""
+    if "like" not in content:
+        return content
     shipped = sorted(file.stem for file in folder.glob("*.yaml"))
-    if given["like"] not in shipped:
-        found, expected = describe_found(given["like"]), f"one of {', '.join(shipped)}"
+    if content["like"] not in shipped:
+        found, expected = describe_found(content["like"]), f"one of {', '.join(shipped)}"
         raise broken_rule("like", found, expected, "Name one, or write all numbers.")
-    whole = dict(_shipped(folder / f"{given['like']}.yaml"))
-    for key, of in given.items():
-        both = isinstance(of, dict) and isinstance(whole.get(key), dict)
-        whole[key] = {**whole[key], **of} if both else of
-    return {key: of for key, of in whole.items() if key != "like"}
+    merged = dict(_shipped(folder / f"{content['like']}.yaml"))
+    for key, part in content.items():
+        both_sections = isinstance(part, dict) and isinstance(merged.get(key), dict)
+        merged[key] = {**merged[key], **part} if both_sections else part
+    return {key: part for key, part in merged.items() if key != "like"}

@@ -1,9 +1,9 @@
-"""What a family of events brings: paths on which nothing happens, events on them, and the motion that they are.
+"""What a family of events brings: paths on which nothing happens, the events on them, and their motion.
 
 All that the harness does is: walk the others' motion without the event → list the events on it, each with its exact
-probability → ask which drivers crash on each → repeat some of them → count. A family is a package that answers the
-questions of `Family`, each once per batch; its kernels are its own, and what it says is arrays. The core repeats its
-scripts, judges, counts and shows them, and knows nothing else of it.
+probability → find out which drivers crash on each → repeat some of them → count. A family is a package with the methods
+of `Family`, each called once per batch. Its kernels are its own, its answers are arrays. The core repeats its scripts,
+judges, counts and shows them, and knows nothing else of it.
 """
 
 from __future__ import annotations
@@ -31,9 +31,9 @@ from harness.vehicles.sideways import TO_OVERLAP_M
 from harness.vocabulary import BoolArray, FloatArray, IntArray, Method, RecordArray
 
 Environment: TypeAlias = Any
-"""All that a family's kernels need of its traffic; what is in it the family alone knows."""
+"""All that a family's kernels need of its traffic; only the family knows what is in it."""
 Parameters: TypeAlias = ParameterFile
-"""Its numbers, each with its provenance."""
+"""The numbers of a traffic, each with its provenance."""
 
 
 class Column(NamedTuple):
@@ -50,10 +50,10 @@ class Column(NamedTuple):
 
 
 class Recorded(NamedTuple):
-    """What vehicles did without an event, on paths (n,); for one that keeps its speed, `HOLDING` (0,).
+    """How the AV moved on paths (n,) without an event; `HOLDING` (0,) for an AV that keeps its speed.
 
-    ``n_steps``, ``failed`` (n,): steps that are on record, and whether the vehicle failed then. ``x_m``, ``v_mps``
-    (n, steps + 1) are its positions and speeds, undefined beyond.
+    ``n_steps`` (n,) are recorded; ``failed`` (n,) says whether the AV failed after them. ``x_m``, ``v_mps``
+    (n, steps + 1) are its positions and speeds, undefined beyond ``n_steps``.
     """
 
     n_steps: IntArray
@@ -62,17 +62,17 @@ class Recorded(NamedTuple):
     v_mps: FloatArray
 
     def mean_distance_m(self, weight: FloatArray) -> float:
-        """Mean distance that the vehicle drives where nothing happens; paths have the ``weight`` (n,)."""
-        whole, rows = ~self.failed, np.arange(len(self.n_steps))
-        distance = self.x_m[rows, self.n_steps] - self.x_m[:, 0]
-        return float((weight * distance)[whole].sum() / weight[whole].sum())
+        """Mean distance (m) that the AV drives without an event, over paths with the ``weight`` (n,)."""
+        complete = ~self.failed
+        distance = self.x_m[np.arange(len(self.n_steps)), self.n_steps] - self.x_m[:, 0]
+        return float((weight * distance)[complete].sum() / weight[complete].sum())
 
     def digest(self) -> str:
-        """Hash of what is on record."""
+        """Hash of all that is recorded."""
         digest = hashlib.sha256(self.n_steps.tobytes() + self.failed.tobytes())
-        known = np.arange(self.x_m.shape[1]) <= self.n_steps[:, None]
+        on_record = np.arange(self.x_m.shape[1]) <= self.n_steps[:, None]
         for values in (self.x_m, self.v_mps):
-            digest.update(values[known].tobytes())
+            digest.update(values[on_record].tobytes())
         return digest.hexdigest()
 
 
@@ -80,10 +80,10 @@ HOLDING = Recorded(np.zeros(0, np.int64), np.zeros(0, np.bool_), np.zeros((0, 1)
 
 
 class Paths(NamedTuple):
-    """Paths (n,): the ``number`` of each, by which all that is drawn on it follows, and how it begins.
+    """Paths (n,): the ``number`` of each, from which all its random numbers follow, and how it begins.
 
-    ``start`` (n,) is a record of the family's own, made from uniforms: also of what drivers are told of the path, such
-    as the headway that people keep on it.
+    ``start`` (n,) are records of the family's own, made from uniforms. They hold also what drivers are told of the
+    path, such as the headway that people keep on it.
     """
 
     number: IntArray
@@ -91,12 +91,12 @@ class Paths(NamedTuple):
 
 
 class Events(NamedTuple):
-    """All events that are asked of paths: rows are paths, columns the family's grid of E events.
+    """Events on paths: rows are paths, columns the family's grid of E events, of which every ``stride``-th is listed.
 
-    ``probability`` (n, E) is ``stride`` · P(event | path) where it is asked, else 0: with uniform offsets the sum over
+    ``probability`` (n, E) is ``stride`` · P(event | path) where it is listed, else 0: with uniform offsets the sum over
     any set of events has its probability as mean. ``crashes`` (n, E) has one bit per driver. ``log_any`` (n,) is the
-    log probability that there is an event on the path. ``after_failure`` (n,) is the most that the probability of an
-    event after a failure of a recorded AV can be, wherever it may be then.
+    log probability that there is an event on the path. ``after_failure`` (n,) is an upper bound of the probability of
+    an event after the failure of a recorded AV, wherever it may be then.
     """
 
     probability: FloatArray
@@ -106,15 +106,17 @@ class Events(NamedTuple):
 
 
 def every_event(probability: FloatArray, crashes: IntArray, stride: int = 1, offset: IntArray | None = None) -> Events:
-    """Every ``stride``-th of events that no AV makes more or less probable, given the ``probability`` of all (n, E)."""
+    """Every ``stride``-th event from each ``offset`` (n,) on, where no AV changes the ``probability`` (n, E) of all."""
     n, n_events = probability.shape
-    asked = np.arange(n_events) % stride == (np.zeros(n, np.int64) if offset is None else offset)[:, None]
+    listed = np.arange(n_events) % stride == (np.zeros(n, np.int64) if offset is None else offset)[:, None]
     total = probability.sum(axis=1)
-    return Events(np.where(asked, stride * probability, 0.0), np.where(asked, crashes, 0), elementary.log(total), total)
+    return Events(
+        np.where(listed, stride * probability, 0.0), np.where(listed, crashes, 0), elementary.log(total), total
+    )
 
 
 class Chosen(NamedTuple):
-    """Events (m,) that were chosen: what has to be known to repeat them.
+    """Chosen events (m,): all that is needed to repeat them.
 
     ``facts`` (m,) are the family's; the event is in step ``at`` (m,), -1 for none, and shows itself ``lead`` (m,) steps
     earlier.
@@ -126,14 +128,14 @@ class Chosen(NamedTuple):
 
 
 FAR_ABOVE = 10.0
-"""Times the highest shipped exposure: one beyond that is likely to count other events [assumed]."""
+"""A fitted exposure so many times above the highest shipped one is likely to count other events [assumed]."""
 
 
 class Exposure(NamedTuple):
     """How many events there are in an hour of driving, between ``low`` and ``high``.
 
-    ``counted`` are events and the hours in which they were, of which the ends are 90 % Poisson limits; None where it is
-    assumed. ``source`` says where it is from.
+    ``counted`` are a number of events and the hours in which they were counted; ``low`` and ``high`` are then 90 %
+    Poisson limits. It is None for an assumed exposure. ``source`` says where it is from.
     """
 
     per_hour: float
@@ -146,9 +148,9 @@ class Exposure(NamedTuple):
 class Driven(NamedTuple):
     """How events (m,) end for drivers (D,).
 
-    ``end`` (m, D) is the step after which each has run into the principal vehicle, below zero for never. Of the last
-    event ``motion`` (D, steps + 1, 2) is each one's position (m) and speed (m/s), 0 where nobody drives, and ``ahead``
-    (steps + 1, 2) the principal vehicle's as if nobody had hit it; both are empty unless they were asked for.
+    ``end`` (m, D) is the step after which each has run into the principal vehicle, below zero for never. The motion on
+    the last event is empty unless it was asked for: ``motion`` (D, steps + 1, 2) are positions (m) and speeds (m/s) of
+    the drivers, 0 where nobody drives, ``ahead`` (steps + 1, 2) those of the principal vehicle as if nobody had hit it.
     """
 
     end: IntArray
@@ -161,37 +163,37 @@ N_MEAN_PATHS = 1024
 
 
 class Family(Protocol):
-    """A kind of events, and what most have alike. ``traffic`` is all that its kernels need of its environment.
+    """A kind of events, with defaults that suit most. ``traffic`` is all that its kernels need of its environment.
 
-    A family has to say the names below that have no value, and `exposure`, `start`, `events`, `choose` and `script`.
+    A family has to define the names below that have no value, and `exposure`, `start`, `events`, `choose` and `script`.
     """
 
     name: str
     vehicles: tuple[str, ...]
     """Names of the vehicles of a cell, the AV last."""
     principal: int
-    """Place of the vehicle that events are about."""
+    """Place, among the vehicles, of the one that events are about."""
     ahead: int
-    """Place of the one ahead of it, -1 without one."""
+    """Place of the vehicle ahead of it, -1 without one."""
     columns: tuple[Column, ...]
     """The facts that records keep."""
     n_uniforms: int
-    """From how many uniforms the beginning of a path is made: what a pool is aimed over."""
+    """Number of uniforms from which the beginning of a path is made; a pool's proposal is over these."""
     model: type[Parameters]
-    """Its parameter files; ``folder`` has those that a name alone stands for."""
+    """Class of its parameter files; the shipped ones lie in its ``folder``."""
     default_parameters: str
-    """The one of them where nothing is said."""
+    """Name of the default parameter file."""
     ladders: Mapping[bool, str]
-    """Libraries of surrogates where nothing is said, by whether events show themselves before they happen."""
+    """Default libraries of surrogates, by whether events show themselves before they happen."""
     follows: bool
     """Whether the AV drives from the start, behind a vehicle that does not look at it: events do not depend on it."""
     stride: int = 1
-    """Events of a path between two that a pool asks."""
+    """A pool lists every ``stride``-th event of a path."""
     pool_error: float = 0.01
-    """Relative standard error of its surrogates' crash rates where nothing is said."""
+    """Default relative standard error of the surrogates' crash rates in a pool."""
     outside_kept: int = 1
-    """Of shells outside the boundary a pool keeps so many times as many events: a vehicle that never crashes is known
-    by them."""
+    """A pool keeps so many times as many events of shells outside the boundary: they decide how low the rate of a
+    vehicle that never crashes is known to be."""
     fitter: str = ""
     """Its fit to trajectories (`harness.fitting.protocol.Fitter`), ``module:class``; empty without one."""
     sources: Mapping[Method, str] = MappingProxyType({})
@@ -201,11 +203,11 @@ class Family(Protocol):
     maps: tuple[tuple[Shown, Shown], ...] = ((GAP, CLOSING),)
     """Axes (x, y) of their maps."""
     stand_ins: Mapping[str, tuple[str, Surrogate]] = MappingProxyType({})
-    """Who is driven in the AV's place (`drive`), by name: a phrase and the driver, the reference driver first."""
+    """Drivers to put in the AV's place (`drive`), by name: a phrase and the driver, the reference driver first."""
 
     @property
     def words(self) -> Words:
-        """What pages say of events."""
+        """Words for pages and terminals."""
         return words_of(event=f"{self.name} event", of=self.vehicles[self.principal])
 
     @property
@@ -216,26 +218,26 @@ class Family(Protocol):
     def parameters(self, settings: EnvironmentSettings) -> Any:
         """The numbers that a campaign's environment names.
 
-        Raises `CampaignError`: the file is missing or wrong, every place being named, or its laws are unsound.
+        Raises `CampaignError`: the file is missing or wrong (each wrong place is named), or its laws are unsound.
         """
         file = shipped_or_own(settings.named(self.default_parameters), self.shipped, "environment.parameters")
         return read_model(file, self.model)
 
     def traffic(self, settings: EnvironmentSettings, parameters: Any = None) -> Environment:
-        """All that kernels need; ``parameters`` are read unless they are given. Here the parameters themselves."""
+        """All that kernels need: here the parameters themselves. ``parameters`` are read unless they are given."""
         return parameters or self.parameters(settings)
 
     def traffic_with(
         self, settings: EnvironmentSettings, parameters: Any, values: Mapping[str, float]
     ) -> Environment | None:
-        """The same with other numbers; None where they give no laws."""
+        """The same with other ``values`` by name; None where they give no sound laws."""
         try:
             return self.traffic(settings, parameters.with_values(values))
         except (CampaignError, ValueError):
             return None
 
     def digest(self, traffic: Environment) -> str:
-        """Hash of all numbers of it."""
+        """Hash of all numbers of a traffic."""
         return hashlib.sha256(_numbers_in(traffic)).hexdigest()[:24]
 
     def max_steps(self, traffic: Environment) -> int:
@@ -243,7 +245,7 @@ class Family(Protocol):
         return int(self.uneventful(traffic, 1).speed.shape[1])
 
     def sideways_m(self, traffic: Environment) -> float:
-        """Way (m) from a first lateral motion to overlap; 0 where nobody changes lanes."""
+        """Distance (m) from a first lateral motion to overlap; 0 where nobody changes lanes."""
         if self.crosses not in (-1, self.principal):
             raise NotImplementedError(f"{self.name} says how far its vehicle {self.crosses} moves sideways")
         return 0.0 if self.crosses < 0 else TO_OVERLAP_M
@@ -253,21 +255,21 @@ class Family(Protocol):
         return False
 
     def exposure(self, traffic: Environment, parameters: Any) -> Exposure:
-        """How often there are events, as `Events.probability` counts them."""
+        """How often there are events of the kind that `Events.probability` is about."""
 
     def milder(self, traffic: Environment) -> Environment | None:
-        """The same with events that are too mild to count, of which some are driven all the same; None without any."""
+        """Traffic whose events are too mild to be in scope, for a few tests of them; None without any."""
         return None
 
     def mean_distance_m(self, traffic: Environment) -> float | None:
         """Mean distance (m) that an AV which keeps its speed drives where nothing happens.
 
-        None where tests know no such distance, as between two events that happen for certain.
+        None if a test has an event for certain, so that no test tells how far it is from one to the next.
         """
         return None
 
     def mean_speed_mps(self, traffic: Environment) -> float:
-        """Mean speed (m/s) of the AV on the road that its exposure is of; here that with which its tests begin."""
+        """Mean speed (m/s) of the AV in the hours of its exposure; by default that with which its tests begin."""
         return float(self.uneventful(traffic, N_MEAN_PATHS).v[:, -1].mean())
 
     def start(self, traffic: Environment, u: FloatArray) -> RecordArray:
@@ -289,10 +291,10 @@ class Family(Protocol):
         """
 
     def choose(self, traffic: Environment, seed: int, paths: Paths, event: IntArray, *, of_pool: bool = True) -> Chosen:
-        """Events of paths (m,), one of each, -1 for none; those of a pool are drawn each for itself."""
+        """One event of each path (m,), -1 for none; in a pool each event of a path has random numbers of its own."""
 
     def onset(self, traffic: Environment, chosen: Chosen) -> IntArray:
-        """Steps (m,) at whose end chosen events begin, -1 for none; what happens in them may be later."""
+        """Steps (m,) at whose end chosen events begin, which may be before they happen; -1 for none."""
         return np.where(chosen.at < 0, -1, np.maximum(chosen.at - chosen.lead, 0))
 
     def first_onset(self, traffic: Environment) -> int | None:
@@ -300,7 +302,7 @@ class Family(Protocol):
         return None
 
     def told(self, facts: Mapping[str, Any]) -> str:
-        """What an event is like, by the columns of its test, as a phrase behind that of its onset; may be empty."""
+        """Phrase that describes an event by the columns of its test, to follow that of its onset; may be empty."""
         return ""
 
     def script(self, traffic: Environment, chosen: Chosen) -> Script:
@@ -317,13 +319,13 @@ class Family(Protocol):
         """Other drivers (D,) in the AV's place, on chosen events (m,), from the end of the step of the onset on.
 
         ``start`` (m, 2) is the AV's position (m) and speed (m/s) then, NaN where it has kept its speed until there.
-        With ``last`` the motion on the last event is told. Nobody asks a family without `stand_ins`.
+        With ``last`` the motion on the last event is given, too. Not called for a family without `stand_ins`.
         """
         raise NotImplementedError
 
 
 def _numbers_in(traffic: Any) -> bytes:
-    """All numbers of a traffic: of parameters, or of a tuple, as kernels take it."""
+    """All numbers of a traffic as bytes: of a parameter file, or of nested tuples of arrays, as kernels take them."""
     if isinstance(traffic, ParameterFile):
         return traffic.content_hash().encode()
     if isinstance(traffic, tuple):

@@ -1,4 +1,4 @@
-"""What a family prescribes of tests, and the core repeats: the motion of the others, and what goes with it."""
+"""What a family prescribes for tests, and the core repeats: the motion of the others, and what goes with it."""
 
 from __future__ import annotations
 
@@ -17,16 +17,17 @@ class Script(NamedTuple):
     """What is prescribed of tests (n,) with V vehicles each, the AV last, and O others.
 
     ``x``, ``v``, ``lane`` (n, V) are positions (m), speeds (m/s) and lanes (0 right, 1 left) at the beginning.
-    ``speed`` (n, steps, O) are the very speeds that the world is told of the others at the end of each step, and
-    ``lanes`` (n, steps, O) on which lanes they then are; no steps if they are driven in the loop. The event is in step
-    ``at`` (n,), -1 for none, and shows itself ``lead`` (n,) steps earlier. ``n_steps`` (n,) are the most of each test,
-    ``acts_from`` (n,) the first in which the AV may act, at most the one after the onset, and ``visible_from`` (n, O)
-    those from which on it sees the others. ``headway_s`` (n,) is what people keep on the path, ``sideways_mps`` (n,)
-    the speed at which a vehicle moves sideways, and ``set_speed_mps`` (n,) at which the AV would cruise: NaN, 0 and NaN
-    (its own) where nothing is said. ``stratum`` (n,) is what a test was drawn from, ``log_weight`` (n,) its log weight,
-    ``log_p_event`` (n,) the log probability of an event on its path, NaN where nobody has asked. ``announced_index``
-    (n,) are the indices that AVs are told, -1 for the test's own, and ``motion_hash`` (n,) of what they must have done
-    when the step of the onset is over, as in their baseline runs; 0 where nobody has one.
+    ``speed`` (n, steps, O) are the speeds of the others at the end of each step, exactly as the world is told, and
+    ``lanes`` (n, steps, O) their lanes then; there are no steps if the others are driven in the loop. The event is in
+    step ``at`` (n,), -1 for none, and shows itself ``lead`` (n,) steps earlier. ``n_steps`` (n,) is the longest that
+    each test may be, ``acts_from`` (n,) the first step in which the AV may act, at most the one after the onset, and
+    ``visible_from`` (n, O) the step from which on it sees each of the others. ``headway_s`` (n,) is what people keep on
+    the path, NaN if unknown; ``sideways_mps`` (n,) the speed at which a vehicle moves sideways, 0 for none;
+    ``set_speed_mps`` (n,) the speed at which the AV would cruise, NaN for its own. ``stratum`` (n,) is what a test was
+    drawn from, ``log_weight`` (n,) its log weight, ``log_p_event`` (n,) the log probability of an event on its path,
+    NaN if not computed. ``announced_index`` (n,) is the index that the AV is told, -1 for the test's own, and
+    ``motion_hash`` (n,) that of how the AV must have moved by the end of the step of the onset, as in its baseline run;
+    0 if there was none.
     """
 
     x: FloatArray
@@ -49,7 +50,7 @@ class Script(NamedTuple):
     motion_hash: UInt64Array
 
     def rows(self, rows: slice) -> Script:
-        """Those of some tests."""
+        """The scripts of some tests."""
         return Script._make(np.ascontiguousarray(column[rows]) for column in self)
 
 
@@ -58,8 +59,8 @@ def natural_script(
 ) -> Script:
     """A script whose tests weigh 1; see `Script`.
 
-    A test may be as long as its motion, and the AV sees all, and acts from the step after the onset on: a family with
-    other tests replaces what is otherwise (`_replace`).
+    A test may be as long as its motion, and the AV sees all others and acts from the step after the onset on. A family
+    whose tests differ replaces these fields (`_replace`).
     """
     n = len(x)
     return Script(

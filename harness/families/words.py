@@ -81,7 +81,7 @@ class Shown(NamedTuple):
 
 GAP = Shown("gap at the event", "m", ("Gap at", "event"), lambda tests: tests["event_gap_m"], beyond=1.4, cell=1.0)
 CLOSING = Shown(
-    "closing speed", "m/s", ("Closing", "speed"), lambda tests: np.asarray(-tests["event_rate_mps"]), beyond=1.15,
-    cell=0.5,
+    "closing speed", "m/s", ("Closing", "speed"),
+    lambda tests: np.asarray(-tests["event_rate_mps"]), beyond=1.15, cell=0.5,
 )  # fmt: skip
 """Gap and closing speed to the vehicle that events are about, at the event: in any family."""

@@ -36,8 +36,8 @@ MOST_FOLLOWERS = 62
 class Followers(NamedTuple):
     """Drivers (D,) to be put in the AV's place: at most `MOST_FOLLOWERS`, without inattention.
 
-    ``envelope`` is the place of the one that crashes wherever another one does: where it does not, nobody else is
-    asked; -1 for none. Crashes count with an impact above ``counts_above_mps``, all of them at 0.
+    ``envelope`` is the place of a driver that crashes wherever another one does, so that the others need not be driven
+    where it does not; -1 for none. Crashes count with an impact above ``counts_above_mps``, all of them at 0.
     """
 
     drivers: RecordArray
@@ -47,12 +47,12 @@ class Followers(NamedTuple):
 
 @cache
 def driver_dtype() -> np.dtype[np.void]:
-    """All parameters of all models, and how a driver lags behind; 0 where one has none, NaN for natural headways."""
+    """All parameters of all models, and of how a driver lags; 0 where a model has none, NaN for natural headways."""
     derived = "reaction_steps", "used_up_steps", "max_jerk_mps3", "inattention_probability", "perceives_lateral_m"
-    own = (model.model_fields for model in get_args(BuiltInParameters))
-    numbers = dict.fromkeys(chain(*own, derived, ("twice_root_mps2",)))
-    whole = "kind", "delay_steps", "inattention_steps", "cruises"
-    return np.dtype([(name, np.int64) for name in whole] + [(name, np.float64) for name in numbers])
+    model_fields = (model.model_fields for model in get_args(BuiltInParameters))
+    numbers = dict.fromkeys(chain(*model_fields, derived, ("twice_root_mps2",)))
+    whole_numbers = "kind", "delay_steps", "inattention_steps", "cruises"
+    return np.dtype([(name, np.int64) for name in whole_numbers] + [(name, np.float64) for name in numbers])
 
 
 def driver_records(
@@ -73,7 +73,7 @@ def driver_records(
             record[name] = math.nan if value == NATURAL else value
         record["reaction_steps"] = 10.0 * record["reaction_time_s"]
         squared = record["acceleration_mps2"] * record["comfortable_deceleration_mps2"]
-        record["twice_root_mps2"] = 2.0 * math.sqrt(squared)  # here, as a root takes kernels long
+        record["twice_root_mps2"] = 2.0 * math.sqrt(squared)  # once, as roots are slow in kernels
         record["max_jerk_mps3"] = math.inf if reaction.max_jerk_mps3 is None else reaction.max_jerk_mps3
         record["perceives_lateral_m"] = reaction.perceives_lateral_m
         record["delay_steps"] = round(reaction.delay_s * 10.0)
@@ -130,9 +130,9 @@ def driver_acceleration(driver: Record, speed: float, lead_speed: float, gap: fl
     """Acceleration (m/s²) of a driver behind a leader at a bumper-to-bumper gap (m), clipped to its limits."""
     if driver.kind == CONSTANT_KIND:
         return float(driver.acceleration_mps2)
-    seen = max(gap, SMALLEST_GAP_M)
+    limited = max(gap, SMALLEST_GAP_M)
     if driver.kind == IDM_KIND:
-        a = idm_acceleration(driver, driver.time_headway_s, speed, lead_speed, seen)
+        a = idm_acceleration(driver, driver.time_headway_s, speed, lead_speed, limited)
     else:
-        a = fvdm_acceleration(driver, speed, lead_speed, fvdm_shape(driver, seen))
+        a = fvdm_acceleration(driver, speed, lead_speed, fvdm_shape(driver, limited))
     return float(min(max(a, driver.min_acceleration_mps2), driver.max_acceleration_mps2))

@@ -7,8 +7,7 @@ that the event reveals as soon as it has perceived that, whichever asks for less
 The reference driver of UN Regulation No. 157 is careful and competent as in `references`, with the danger of lead
 braking: it has evaluated that ``risk_evaluation_s`` after it has seen the vehicle ahead brake harder than
 ``perceives_braking_mps2`` (for 0 it knows of the danger at the onset), and one revealed as late after it has seen it.
-The IDM by which it follows waits for its reaction time after the onset, too: else it would be the better driver for not
-being one of flesh and blood.
+The IDM by which it follows waits for its reaction time after the onset, too: else it would react faster than a human.
 """
 
 from __future__ import annotations
@@ -44,7 +43,7 @@ def headway_of(driver: Record, natural_s: float, speed: float) -> float:
 
 @compiled_inline
 def seen_after(perceives_m: float, lateral_mps: float, clear: int) -> int:
-    """Steps from the onset of a lateral motion (m/s) until it has come to so many metres, or is over (``clear``)."""
+    """Steps from the onset of a lateral motion (m/s) until it has reached ``perceives_m``, or is over (``clear``)."""
     return min(math.ceil(perceives_m / (lateral_mps * STEP_S) - _ROUNDING), clear)
 
 
@@ -80,7 +79,7 @@ def behind(driver: Record, headway_s: float, speed: float, lead: Ahead) -> float
 def follow_on(
     driver: Record, headway_s: float, memory: Memory, since: int, late: bool, speed: float, lead: Ahead, revealed: Ahead
 ) -> Memory:
-    """What a driver does in a step, as what it will remember of it.
+    """Memory of a driver, with its acceleration, after a step.
 
     ``since`` counts steps from the first in which it reacts to the event, and is negative before; it is ``late``
     between the onset and that.
@@ -115,12 +114,13 @@ def careful_competent(
             danger = min(danger, float(since))
     coasts = part_after(since, danger, 0.0)
     idle = changing(coasts, memory.acceleration, max(-driver.coasting_mps2, driver.min_acceleration_mps2))
-    from_ = min(idle, 0.0)
+    coasting = min(idle, 0.0)
     nearest = lead if lead.gap < revealed.gap else revealed
-    follows = built_up(driver, memory, from_, behind(driver, headway_s, speed, nearest))
+    follows = built_up(driver, memory, coasting, behind(driver, headway_s, speed, nearest))
     follows_on = part_after(since, 0.0, driver.reaction_steps)
     if coasts == 0.0:
         return changing(follows_on, idle, follows), danger
-    brakes = built_up(driver, memory, from_, driver.min_acceleration_mps2)
+    brakes = built_up(driver, memory, coasting, driver.min_acceleration_mps2)
     braking = part_after(since, danger, driver.reaction_steps)  # within the other part: no danger is before the onset
-    return (1.0 - follows_on) * idle + (follows_on - braking) * min(idle, follows) + braking * brakes, danger
+    a = (1.0 - follows_on) * idle + (follows_on - braking) * min(idle, follows) + braking * brakes
+    return a, danger

@@ -55,10 +55,10 @@ class Library(Section):
     _counts_above_mps: float = PrivateAttr(0.0)
 
     def counting_above(self, speed_mps: float) -> Library:
-        """The library of a campaign in which drivers crash with an impact above a speed alone, as its vehicle."""
-        other = self.model_copy()
-        other._counts_above_mps = speed_mps
-        return other
+        """The library of a campaign in which crashes count only with an impact above a speed, also those of drivers."""
+        library = self.model_copy()
+        library._counts_above_mps = speed_mps
+        return library
 
     def followers(self, see_onset: bool) -> Followers:
         """The surrogates and then the references as kernels read them, in the order of the file, D + R of them."""
@@ -79,7 +79,7 @@ class Library(Section):
         return self.surrogates[self.envelope].parameters.max_acceleration_mps2
 
     def require_drivers(self, *, follows: bool) -> None:
-        """Refuse (`CampaignError`) a library of drivers who cannot drive, where the AV ``follows`` or does not."""
+        """Refuse (`CampaignError`) drivers who cannot drive in a family in which the AV ``follows``, or does not."""
         for name, each in (self.surrogates | self.references).items():
             natural = getattr(each.parameters, "time_headway_s", None) == NATURAL
             if follows and each.model == "r157-fsm":
@@ -91,12 +91,12 @@ class Library(Section):
             mend = "Choose the scenario's own library (pool.library: null), or delete the driver from yours."
             raise CampaignError(f"pool.library, {name}", found, expected, mend)
 
-    def require_reference(self, asked: str) -> None:
-        """Refuse (`CampaignError`) a limit beside a reference driver that is not there."""
-        if asked not in self.references:
+    def require_reference(self, name: str) -> None:
+        """Refuse (`CampaignError`) a limit by a reference driver that the library does not have."""
+        if name not in self.references:
             expected = f"a reference driver of the surrogate library: {listed(self.references)}"
-            mend = did_you_mean(asked, list(self.references)) or "Name one of them, or add it to a library of your own."
-            raise CampaignError("accept.times_reference.driver", f"'{asked}'", expected, mend)
+            mend = did_you_mean(name, list(self.references)) or "Name one of them, or add it to a library of your own."
+            raise CampaignError("accept.times_reference.driver", f"'{name}'", expected, mend)
 
     @model_validator(mode="after")
     def _names_are_known(self) -> Self:
@@ -137,7 +137,7 @@ def shipped_drivers() -> dict[str, Surrogate]:
 
 
 def load_library(name: str | None) -> Library:
-    """Read a shipped library by name, or a file by its path; without either that for cut-ins of one step.
+    """Read a shipped library by name, or a file by its path; without a name that for cut-ins of one step.
 
     Raises `CampaignError`: names every place that is wrong.
     """

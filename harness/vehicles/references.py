@@ -27,9 +27,9 @@ from harness.vocabulary import Record
 class Memory(NamedTuple):
     """What a driver remembers from step to step.
 
-    ``acceleration`` (m/s²) is that of the step before, ``danger`` the step, counted from the first in which it could
-    act, in which the danger was perceived that it reacts to: infinite for none, negative for one seen before.
-    ``used_up`` (steps) is how long before that step it has perceived that BV comes over.
+    ``acceleration`` (m/s²) is that of the step before. ``danger`` is the step in which it perceived the danger that it
+    reacts to, counted from the first in which it could act: infinite for none, negative for one seen before.
+    ``used_up`` (steps) is how long before that first step it perceived that BV comes over.
     """
 
     acceleration: float
@@ -45,7 +45,7 @@ def part_after(step: int, since: float, delay: float) -> float:
 
 @compiled_inline
 def changing(part: float, before: float, after: float) -> float:
-    """Mean of a quantity over a step, in a part of which it has its value from after a change."""
+    """Mean of a quantity over a step, which changes from ``before`` to ``after`` for the last ``part`` of it."""
     return (1.0 - part) * before + part * after
 
 
@@ -66,7 +66,7 @@ def built_up(driver: Record, memory: Memory, idle: float, wanted: float) -> floa
 
 @compiled_inline
 def first_perceived(memory: Memory, step: int) -> float:
-    """When a danger was perceived that is there in a step: in the first, while BV was still coming over."""
+    """Step in which a danger was perceived that is new in ``step``; in step 0, while BV was still coming over."""
     return -memory.used_up if step == 0 else float(step)
 
 
@@ -122,11 +122,11 @@ def critical_metric(driver: Record, speed: float, lead_speed: float, gap: float,
         return 0.0
     delay = driver.reaction_steps * STEP_S
     a = max(acceleration, -driver.comfortable_braking_mps2)
-    left = closing + a * delay
-    if left < 0.0:  # what it does now is enough, if there is room
+    closing_then = closing + a * delay
+    if closing_then < 0.0:  # what it does now is enough, if there is room
         return 1.0 if gap < (closing * closing) / (2.0 * abs(acceleration)) else 0.0
     reaction = (closing + a * delay / 2.0) * delay
-    squared = left * left
+    squared = closing_then * closing_then
     safe = reaction + squared / (2.0 * driver.comfortable_braking_mps2)
     unsafe = reaction + squared / (2.0 * driver.hard_braking_mps2)
     return between(gap, safe, unsafe)
@@ -163,13 +163,13 @@ def fuzzy_safety(
 
 
 @compiled_inline
-def still_cruises(cruises: bool, bv_overlaps: bool, asked: float) -> bool:
+def still_cruises(cruises: bool, bv_overlaps: bool, acceleration: float) -> bool:
     """Whether a vehicle that cruises still does: until it first asks to brake (m/s²), or BV is on its lane.
 
     One rule for all kinds of vehicles. A controller that sees nobody ahead would else speed up, or not, by what it
     takes for its desired speed, and crash three times as often by that alone.
     """
-    return cruises and not bv_overlaps and asked >= 0.0
+    return cruises and not bv_overlaps and acceleration >= 0.0
 
 
 @compiled_inline
@@ -182,7 +182,7 @@ def reaction_steps(driver: Record, seed: int, episode: int) -> int:
 
 @compiled_inline
 def react(driver: Record, memory: Memory, step: int, speed: float, lead_speed: float, gap: float) -> Memory:
-    """What a driver does in a step, as what it will remember of it.
+    """Memory of a driver, with its acceleration, after a step.
 
     ``step`` counts from 0, the first one in which it acts.
     """

@@ -32,9 +32,9 @@ def lateral_position(state: int, at: int, lead: int, distance_m: float) -> float
 
 @compiled_inline
 def perceived_in(perceives_m: float, at: int, lead: int, distance_m: float) -> tuple[int, float]:
-    """First step in which somebody may act who perceives a lateral motion of so many metres; the overlap anyone.
+    """First step in which a driver may act who perceives a lateral motion of ``perceives_m``, or else the overlap.
 
-    And by how much of a step it was perceived before that: drivers whose delays need not be whole steps count it.
+    And the part of a step by which it was perceived earlier, for drivers whose delays need not be whole steps.
     """
     until = float(lead)
     if lead > 0 and perceives_m < distance_m:

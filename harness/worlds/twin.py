@@ -19,7 +19,7 @@ def advance(x: FloatArray, v: FloatArray, speed: FloatArray) -> None:
 
 @compiled
 def contacts(x: FloatArray, before: Int8Array, lane: Int8Array, out: BoolArray) -> None:
-    """Which cells (K,) have vehicles of one lane in contact.
+    """Write to ``out`` (K,) in which cells vehicles of one lane are in contact.
 
     A vehicle that changes lanes in a step moves on the lane that it had ``before`` (K, V) and then changes to its
     ``lane`` (K, V): it may touch vehicles on both.

@@ -26,14 +26,14 @@ from harness.vehicles.kinematics import CONTACT_M, gap, next_speed
 from harness.vocabulary import AV, LV, Int8Array, IntArray
 
 FREE_DRAWS_PER_CUT_IN = 256
-"""Stride of the uniforms for BV's free driving: each cut-in time of a path of a pool has draws of its own."""
+"""Uniforms for BV's free driving after one cut-in: in a pool each cut-in time of a path has draws of its own."""
 
 
 class Maneuvers(NamedTuple):
     """Maneuvers of LV and BV on paths (n,).
 
-    ``lv``, ``bv`` (n, draws), 31 marking the cut-in; ``n_lv``, ``n_bv`` (n,) how many there are. ``lead`` (n,) is how
-    many steps earlier BV begins to move sideways.
+    ``lv``, ``bv`` (n, draws) are maneuver indices, 31 marking the cut-in, of which ``n_lv``, ``n_bv`` (n,) are used.
+    BV begins to move sideways ``lead`` (n,) steps before the cut-in.
     """
 
     lv: Int8Array
@@ -54,12 +54,11 @@ def enumerate_cut_ins(
 ) -> Events:
     """Every ``stride``-th cut-in of paths (n,), by their steps; see `harness.families.protocol.Family.events`."""
     n, steps = paths.number.size, int(traffic.numbers["max_steps"])
-    found = Events(np.zeros((n, steps)), np.zeros((n, steps), np.int64), np.zeros(n), np.zeros(n))
+    events = Events(np.zeros((n, steps)), np.zeros((n, steps), np.int64), np.zeros(n), np.zeros(n))
     first = np.zeros(n, np.int64) if offset is None else offset
-    scratch = empty_trajectory(traffic)
-    known = unboxed(traffic), unboxed(drivers), unboxed(recorded)
-    _enumerate(seed, unboxed(paths), stride, first, *known, unboxed(scratch), unboxed(found))
-    return found
+    given = unboxed(traffic), unboxed(drivers), unboxed(recorded)
+    _enumerate(seed, unboxed(paths), stride, first, *given, unboxed(empty_trajectory(traffic)), unboxed(events))
+    return events
 
 
 @compiled_threads
@@ -72,7 +71,7 @@ def _enumerate(
     followers: Followers,
     recorded: Recorded,
     path: Trajectory,
-    found: Events,
+    out: Events,
 ) -> None:
     max_steps = environment.numbers.max_steps
     for i in range(offset.size):
@@ -86,20 +85,20 @@ def _enumerate(
         hazard = 0.0
         for cut in range(steps):
             if path.hazard[cut] > 0.0 and cut % stride == offset[i]:
-                found.probability[i, cut] = stride * (math.exp(-hazard) * -math.expm1(-path.hazard[cut]))
+                out.probability[i, cut] = stride * (math.exp(-hazard) * -math.expm1(-path.hazard[cut]))
                 if followers.drivers.size > 0:
                     leave(cut, max_steps, seed, number, cut * FREE_DRAWS_PER_CUT_IN, environment, path)
                     if gap(path.x[cut + 1, LV], path.x_after[cut + 1]) >= CONTACT_M:  # else it ends as bv_lv_contact
                         lead = draw_lead(cut, seed, number, environment.lateral)
-                        found.crashes[i, cut] = who_crashes(followers, cut, lead, environment, path)
+                        out.crashes[i, cut] = who_crashes(followers, cut, lead, environment, path)
             hazard += path.hazard[cut]
-        found.log_any[i] = math.log(-math.expm1(-hazard))
+        out.log_any[i] = math.log(-math.expm1(-hazard))
         if recorded.failed.size > 0 and recorded.failed[i]:
-            most = 0.0
+            hazard_beyond = 0.0
             for step in range(steps, reach):
                 wish = laws.opportunity(state_of(path.x[step], path.v[step]), environment)
-                most += laws.cut_in_hazard(wish, 1.0, environment)
-            found.after_failure[i] = math.exp(-hazard) * -math.expm1(-most)
+                hazard_beyond += laws.cut_in_hazard(wish, 1.0, environment)
+            out.after_failure[i] = math.exp(-hazard) * -math.expm1(-hazard_beyond)
 
 
 def write_maneuvers(
@@ -112,33 +111,32 @@ def write_maneuvers(
     scratch, n = empty_trajectory(environment), paths.number.size
     lv, bv = np.zeros((2, n, scratch.lv.size), np.int8)
     n_lv, n_bv, lead = np.zeros((3, n), np.int64)
-    found = Maneuvers(lv, bv, n_lv, n_bv, lead)
-    known = unboxed(environment), unboxed(scratch), unboxed(found)
-    _write(seed, unboxed(paths), cut, draws_per_cut_in, *known)
-    return found
+    maneuvers = Maneuvers(lv, bv, n_lv, n_bv, lead)
+    _write(seed, unboxed(paths), cut, draws_per_cut_in, unboxed(environment), unboxed(scratch), unboxed(maneuvers))
+    return maneuvers
 
 
 @compiled_threads
 def _write(
-    seed: int, paths: Paths, cut: IntArray, stride: int, environment: Environment, path: Trajectory, found: Maneuvers
+    seed: int, paths: Paths, cut: IntArray, stride: int, environment: Environment, path: Trajectory, out: Maneuvers
 ) -> None:
-    n, lv, bv = environment.numbers, found.lv, found.bv
+    n, lv, bv = environment.numbers, out.lv, out.bv
     for i in range(cut.size):
         number, until = paths.number[i], cut[i] + 1 if cut[i] >= 0 else n.max_steps
         steps = walk(paths.start[i], seed, number, until, False, environment, path)
         before = (steps - 1) // n.hold_steps + 1
         for m in range(before):
             lv[i, m], bv[i, m] = path.lv[m], path.bv[m]
-        found.n_lv[i] = found.n_bv[i] = before
+        out.n_lv[i] = out.n_bv[i] = before
         if cut[i] < 0:
             continue
         bv[i, before] = CUT_IN
-        drawn = leave(cut[i], n.max_steps, seed, number, cut[i] * stride, environment, path)
-        for m in range(drawn):
+        n_free = leave(cut[i], n.max_steps, seed, number, cut[i] * stride, environment, path)
+        for m in range(n_free):
             bv[i, before + 1 + m] = path.free[m]
-        found.n_bv[i] += 1 + drawn
-        found.lead[i] = draw_lead(cut[i], seed, number, environment.lateral)
-        found.n_lv[i] = (n.max_steps - 1) // n.hold_steps + 1
+        out.n_bv[i] += 1 + n_free
+        out.lead[i] = draw_lead(cut[i], seed, number, environment.lateral)
+        out.n_lv[i] = (n.max_steps - 1) // n.hold_steps + 1
         v = path.v[0, LV]
         for step in range(n.max_steps):
             m = step // n.hold_steps

@@ -1,4 +1,4 @@
-"""The cut-in as a family of events: what the core asks, answered by the kernels of this package."""
+"""The cut-in as a family of events: the methods that the core calls, by the kernels of this package."""
 
 from __future__ import annotations
 
@@ -31,12 +31,6 @@ STATE_FACTS = (
     Column("r2_m", pa.float64(), "m", "gap BV-AV, bumper to bumper"),
     Column("r2dot_mps", pa.float64(), "m/s", "rate of R2: v_BV - v_AV"),
 )
-MANEUVER_FACTS = (
-    Column("lv_maneuvers", pa.list_(pa.int8()), "1", "LV's draws, in order", "n_lv"),
-    Column("bv_maneuvers", pa.list_(pa.int8()), "1", "BV's draws, in order; 31 marks the cut-in", "n_bv"),
-)
-
-
 DISTANCE_SEED = DISTANCE_PATHS = 20_000
 """Paths over which the mean distance of a test is taken; its standard error is below 0.5 %. Tests with a cut-in are too
 few (some 3e-5 at level 1) to matter."""
@@ -54,7 +48,11 @@ class CutIn(Family):
     name = "cut_in"
     vehicles = VEHICLES
     principal, ahead = BV, LV
-    columns = (*(each._replace(doc=f"initial {each.doc}") for each in STATE_FACTS), *MANEUVER_FACTS)
+    columns = (
+        *(each._replace(doc=f"initial {each.doc}") for each in STATE_FACTS),
+        Column("lv_maneuvers", pa.list_(pa.int8()), "1", "LV's draws, in order", "n_lv"),
+        Column("bv_maneuvers", pa.list_(pa.int8()), "1", "BV's draws, in order; 31 marks the cut-in", "n_bv"),
+    )
     n_uniforms = len(STATE_COLUMNS)
 
     model, default_parameters = EnvironmentParameters, DEFAULT

@@ -36,7 +36,7 @@ class LateralMotion(NamedTuple):
 
 
 def constant_lead(lead_s: float = 0.0, distance_m: float = TO_OVERLAP_M) -> LateralMotion:
-    """Every cut-in shows itself this long before overlap; not at all as in the paper."""
+    """The same lead for every cut-in; by default none, as in the paper."""
     cumulative = np.zeros(round(lead_s / STEP_S) + 1)
     cumulative[-1] = 1.0
     return LateralMotion(distance_m, cumulative)
@@ -52,7 +52,7 @@ def log_normal_speed(distance_m: float, median_mps: float, log_sd: float, longes
 
 @compiled_inline
 def draw_lead(cut: int, seed: int, episode: int, lateral: LateralMotion) -> int:
-    """Lead (steps) of the cut-in that overlaps after a step."""
+    """Lead (steps) of the cut-in in step ``cut``."""
     last = lateral.cumulative.size - 1
     if last == 0:
         return 0

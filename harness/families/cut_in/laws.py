@@ -217,9 +217,9 @@ def car_following_mean(state: State, environment: Environment) -> float:
     mean = n.car_following__gain_rate_per_s * r1dot + n.car_following__gain_gap_per_s2 * (gap - median)
     if r1dot < 0.0:
         room = max(r1 - n.car_following__standstill_m, n.car_following__smallest_gap_m)
-        needed = (r1dot * r1dot) / (2.0 * room)
-        if needed > n.car_following__closing_threshold_mps2:
-            mean = -n.car_following__closing_gain * needed
+        needed_mps2 = (r1dot * r1dot) / (2.0 * room)
+        if needed_mps2 > n.car_following__closing_threshold_mps2:
+            mean = -n.car_following__closing_gain * needed_mps2
     if r1 < n.car_following__near_gap_m:
         mean = min(mean, n.car_following__near_mean_max_mps2)
     return float(mean)
@@ -315,13 +315,15 @@ class InitialStates(Flow):
 
     def from_uniforms(self, u: FloatArray) -> RecordArray:
         """States (n,) from uniforms (n, 5), one for each of their numbers."""
-        n, of = self._n, states_from(u.T)
-        v = self.speeds(of["v_bv_mps"])
-        r1 = self.gaps(of["r1_m"], v)
-        r1dot = self._rate(of["r1dot_mps"], v, r1)
-        r2 = n["initial_state__r2_min_m"] + of["r2_m"] * (n["initial_state__r2_max_m"] - n["initial_state__r2_min_m"])
+        n = self._n
+        probability = states_from(u.T)
+        v = self.speeds(probability["v_bv_mps"])
+        r1 = self.gaps(probability["r1_m"], v)
+        r1dot = self._rate(probability["r1dot_mps"], v, r1)
+        low, high = n["initial_state__r2_min_m"], n["initial_state__r2_max_m"]
+        r2 = low + probability["r2_m"] * (high - low)
         span = n["initial_state__r2dot_max_mps"] - n["initial_state__r2dot_min_mps"]
-        r2dot = n["initial_state__r2dot_min_mps"] + of["r2dot_mps"] * span
+        r2dot = n["initial_state__r2dot_min_mps"] + probability["r2dot_mps"] * span
         return states_from([v, r1, r1dot, r2, r2dot])
 
     def given_speed(self, speed: float, gap_u: FloatArray, rate_u: FloatArray) -> RecordArray:

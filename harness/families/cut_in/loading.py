@@ -1,8 +1,7 @@
 """Load an environment: a shipped parameter file or the user's own, validated, as kernels read it.
 
-Each number may be in order and still a law give no probability: an exponent that overflows, a range that holds nothing
-of a distribution, a share that rounds to zero. So what the numbers imply is evaluated once, on a grid over the fit
-range, before anything rests on it.
+Even if each number is allowed, a law may give no probabilities: an exponent overflows, a range holds nothing of a
+distribution, a share rounds to zero. So laws are evaluated once, on a grid over the fit range, before they are used.
 """
 
 from __future__ import annotations
@@ -28,7 +27,7 @@ RARE = PROBABILITIES.size - 2
 FASTEST_LV_MPS = 100.0
 """Speed limit of SUMO's lanes; LV may exceed it in one of a million tests."""
 SCALES_MPS2 = (1e-3, 50.0)
-"""Noise far below the 0.2 m/s² bins is none; above 50 m/s² nearly all of it lies beyond the grid of accelerations."""
+"""Limits of the scale of noise: far below the 0.2 m/s² bins it is none; above 50 m/s² nearly all is beyond the grid."""
 SMALLEST_CHANCE = 1e-200
 """Products of chances over a path must not round to zero: the forced cut-in divides by them."""
 RATES_MPS = np.linspace(-40.0, 40.0, 9)
@@ -50,15 +49,15 @@ def load_parameters(settings: EnvironmentSettings) -> EnvironmentParameters:
 
 def load_environment(settings: EnvironmentSettings, parameters: EnvironmentParameters | None = None) -> Environment:
     """The environment of a campaign, with its tables; ``parameters`` are read unless they are given."""
-    given = parameters or load_parameters(settings)
+    parameters = parameters or load_parameters(settings)
     level, hold_s = settings.lane_change_level, settings.acceleration_hold_s
-    numbers = parameter_record(given, lane_change_level=level, hold_s=hold_s)
-    lateral = constant_lead() if given.lateral is None else given.lateral.motion()
+    numbers = parameter_record(parameters, lane_change_level=level, hold_s=hold_s)
+    lateral = constant_lead() if parameters.lateral is None else parameters.lateral.motion()
     if settings.cut_in_lead_s is not None:
         lateral = constant_lead(settings.cut_in_lead_s, lateral.distance_m)
-    wish, steps = given.hazard_table, given.acceptance_steps
-    tables = wish.wish() if wish else Wish(*np.empty((3, 0, 2))), steps.steps() if steps else np.empty((0, 2))
-    return build_environment(numbers, lateral, *tables)
+    hazard, steps = parameters.hazard_table, parameters.acceptance_steps
+    wish = hazard.wish() if hazard else Wish(*np.empty((3, 0, 2)))
+    return build_environment(numbers, lateral, wish, steps.steps() if steps else np.empty((0, 2)))
 
 
 def require_sound_laws(environment: Environment, file: str) -> None:
@@ -79,9 +78,10 @@ def require_sound_laws(environment: Environment, file: str) -> None:
         limits = "a scale from {:g} to {:g} m/s²".format(*SCALES_MPS2)
         inside = (scale[law] >= SCALES_MPS2[0]) & (scale[law] <= SCALES_MPS2[1])
         require(inside, where, "noise of scale {:.3g} m/s²" + _IN_STATE, (scale[law], *states.T), limits)
-        whole = (pmf[law] >= 0.0).all(axis=1) & (np.abs(total - 1.0) < 1e-9)
-        require(whole, where, "probabilities that sum to {:.12g}" + _IN_STATE, (total, *states.T), "a sum of 1")
-    is_share, where = (accepted > 0.0) & (accepted <= 1.0), f"cut_in.accept_scale_s and cut_in.ignore_share ({file})"
+        sums_to_1 = (pmf[law] >= 0.0).all(axis=1) & (np.abs(total - 1.0) < 1e-9)
+        require(sums_to_1, where, "probabilities that sum to {:.12g}" + _IN_STATE, (total, *states.T), "a sum of 1")
+    is_share = (accepted > 0.0) & (accepted <= 1.0)
+    where = f"cut_in.accept_scale_s and cut_in.ignore_share ({file})"
     found = "a share of {:.3g} accepted at R2 = {:g} m, R2dot = {:g} m/s"
     require(is_share, where, found, (accepted, *approaches.T), "a share above 0 and at most 1")
     possible = np.isfinite(chance) & (chance * accepted.min() > SMALLEST_CHANCE)

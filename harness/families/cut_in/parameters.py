@@ -81,7 +81,7 @@ class EnvironmentParameters(ParameterFile):
         return self.acceptance_steps
 
     def left_open(self) -> LeftOpen | None:
-        """The range that is stated for who does not look, or shares of lane changes where none was seen."""
+        """The stated range of the share of drivers who do not look, or shares of lane changes where none was seen."""
         share, steps = self.cut_in.ignore_share, self.acceptance_steps
         if share is not None and share.range is not None:
             low, high = share.range
@@ -102,8 +102,8 @@ def parameter_record(parameters: EnvironmentParameters, *, lane_change_level: fl
     Coefficients in whose place there is a table are no numbers: records of all environments are of one type.
     """
     absent = {f"cut_in__{name}": math.nan for names in REPLACED.values() for name in names}
-    given = {**absent, **parameters.values(), "level": lane_change_level}
-    numbers = {name: value for name, value in given.items() if not name.startswith(_NOT_IN_RECORD)}
+    values = {**absent, **parameters.values(), "level": lane_change_level}
+    numbers = {name: value for name, value in values.items() if not name.startswith(_NOT_IN_RECORD)}
     steps = {"hold_steps": round(hold_s / STEP_S), "max_steps": round(numbers["scenario__duration_s"] / STEP_S)}
     dtype = [*((name, "f8") for name in numbers), *((name, "i8") for name in steps)]
     record: Record = np.array([(*numbers.values(), *steps.values())], dtype)[0]

@@ -34,13 +34,12 @@ FOLLOWER_DTYPE = np.dtype(
 
 
 class Trajectory(NamedTuple):
-    """Room for one; positions in m, speeds in m/s.
+    """Room for one trajectory; positions in m, speeds in m/s.
 
-    ``lv``, ``bv`` (draws,) are maneuver indices before the cut-in, ``x``, ``v`` (steps + 1, 3) the motion of LV, BV, AV
-    without it, and ``hazard`` (steps,) that of cutting in.
-    ``free`` (draws,) are BV's maneuvers after the cut-in, ``x_after``, ``v_after`` (steps + 1,) its motion, and
-    ``slowest`` (steps + 1,) the lowest speed that it will have from there on. ``follower`` (`MOST_FOLLOWERS`,) are
-    those behind it.
+    Without a cut-in: ``lv``, ``bv`` (draws,) are maneuver indices, ``x``, ``v`` (steps + 1, 3) the motion of LV, BV and
+    AV, ``hazard`` (steps,) that of cutting in. After one: ``free`` (draws,) are BV's maneuvers, ``x_after``,
+    ``v_after`` (steps + 1,) its motion, ``slowest`` (steps + 1,) the lowest speed that it will have from there on.
+    ``follower`` (`MOST_FOLLOWERS`,) are the drivers behind it.
     """
 
     lv: Int8Array
@@ -96,7 +95,7 @@ def state_of(x: FloatArray, v: FloatArray) -> State:
 def walk(
     state: State, seed: int, episode: int, until: int, ends_passed: bool, environment: Environment, path: Trajectory
 ) -> int:
-    """Walk from an initial state to a step, or to the end that an episode without cut-in finds; returns the step.
+    """Walk from an initial state ``until`` a step, or to an earlier end of a test without cut-in; returns that step.
 
     The AV keeps its speed, and ``ends_passed`` says whether the walk ends where it has passed BV.
     """
@@ -131,9 +130,9 @@ def weigh_cut_ins(steps: int, environment: Environment, path: Trajectory) -> flo
 
 @compiled_inline
 def leave(cut: int, until: int, seed: int, episode: int, first: int, environment: Environment, path: Trajectory) -> int:
-    """BV's motion from its cut-in in step ``cut`` to a step; returns how many maneuvers that takes.
+    """Draw BV's motion from its cut-in in step ``cut`` ``until`` a step; returns the number of maneuvers.
 
-    They are drawn, ``first`` being the index of the first.
+    ``first`` is the index of their first uniform.
     """
     hold_steps = environment.numbers.hold_steps
     x, v = path.x[cut, BV], path.v[cut, BV]
@@ -167,57 +166,58 @@ def take_over(
     environment: Environment,
     path: Trajectory,
 ) -> None:
-    """Driver ``d`` is to take over from the AV after the step of the onset, as follower ``place``; see `follow`.
+    """Let driver ``d`` take over from the AV after the step of the onset, as follower ``place``; see `follow`.
 
     It reacts ``late`` steps after it has perceived BV. One that ``encloses`` others acts from the onset.
     """
-    driver, one, onset = drivers[d], path.follower[place], onset_of(cut, lead)
+    driver, follower = drivers[d], path.follower[place]
+    onset = onset_of(cut, lead)
     perceives_m = 0.0 if encloses else driver.perceives_lateral_m
     perceived, earlier = perceived_in(perceives_m, cut, lead, environment.lateral.distance_m)
-    one.driver, one.encloses, one.first, one.end = d, encloses, perceived + late, FOLLOWS
-    one.x, one.v = path.x[onset + 1, AV], path.v[onset + 1, AV]
-    one.acceleration, one.danger, one.used_up = 0.0, math.inf, driver.used_up_steps + earlier
-    one.cruises = driver.cruises and not encloses
-    if onset == cut and gap(path.x_after[cut + 1], one.x) < CONTACT_M:
-        one.end = cut + 1
+    follower.driver, follower.encloses, follower.first, follower.end = d, encloses, perceived + late, FOLLOWS
+    follower.x, follower.v = path.x[onset + 1, AV], path.v[onset + 1, AV]
+    follower.acceleration, follower.danger, follower.used_up = 0.0, math.inf, driver.used_up_steps + earlier
+    follower.cruises = driver.cruises and not encloses
+    if onset == cut and gap(path.x_after[cut + 1], follower.x) < CONTACT_M:
+        follower.end = cut + 1
 
 
 @compiled_inline
 def follow(n: int, drivers: RecordArray, cut: int, lead: int, until: int, path: Trajectory) -> None:
-    """Drive the first ``n`` followers behind BV, which shows ``lead`` steps before its cut-in that it will come over.
+    """Drive the first ``n`` followers behind BV, which moves sideways from ``lead`` steps before its cut-in on.
 
     ``end`` of each receives the step after which it has run into BV, `NO_CRASH` or `WAS_AHEAD`, and ``v`` its speed
-    then. One that encloses others also counts as having run into BV where it has passed it before the overlap: a slower
-    one may not have. Side by side, because each waits for its own last result in every operation of a step.
+    then. A follower that encloses others counts as having run into BV also if it has passed BV before the overlap: a
+    slower one may not have. They are driven side by side, so that no operation has to wait for the result of the last.
     """
-    left = 0
+    n_following = 0
     for i in range(n):
-        left += path.follower[i].end == FOLLOWS
+        n_following += path.follower[i].end == FOLLOWS
     for step in range(onset_of(cut, lead) + 1, until):
-        if left == 0:
+        if n_following == 0:
             return
         x_bv, v_bv, x_next = path.x_after[step], path.v_after[step], path.x_after[step + 1]
         if step <= cut:
             x_bv, v_bv = path.x[step, BV], path.v[step, BV]
         for i in range(n):
-            one = path.follower[i]
-            if one.end != FOLLOWS:
+            follower = path.follower[i]
+            if follower.end != FOLLOWS:
                 continue
-            driver, ahead = drivers[one.driver], gap(x_bv, one.x)
-            if step > cut and never_reaches(driver, one.v, ahead, path.slowest[step], until - step):
-                one.end = NO_CRASH
-                left -= 1
+            driver, ahead = drivers[follower.driver], gap(x_bv, follower.x)
+            if step > cut and never_reaches(driver, follower.v, ahead, path.slowest[step], until - step):
+                follower.end = NO_CRASH
+                n_following -= 1
                 continue
-            if step >= one.first:
-                memory = Memory(one.acceleration, one.danger, one.used_up)
-                memory = react(driver, memory, step - one.first, one.v, v_bv, ahead)
-                one.cruises = still_cruises(one.cruises, step > cut, memory.acceleration)
-                one.acceleration, one.danger = 0.0 if one.cruises else memory.acceleration, memory.danger
-            v_after = next_speed(one.v, one.acceleration)
-            one.x, one.v = next_position(one.x, one.v, v_after), v_after
-            if step >= cut and gap(x_next, one.x) < CONTACT_M:
-                one.end = step + 1 if one.encloses or overlaps(x_next, one.x) else WAS_AHEAD
-                left -= 1
+            if step >= follower.first:
+                memory = Memory(follower.acceleration, follower.danger, follower.used_up)
+                memory = react(driver, memory, step - follower.first, follower.v, v_bv, ahead)
+                follower.cruises = still_cruises(follower.cruises, step > cut, memory.acceleration)
+                follower.acceleration, follower.danger = 0.0 if follower.cruises else memory.acceleration, memory.danger
+            v_after = next_speed(follower.v, follower.acceleration)
+            follower.x, follower.v = next_position(follower.x, follower.v, v_after), v_after
+            if step >= cut and gap(x_next, follower.x) < CONTACT_M:
+                follower.end = step + 1 if follower.encloses or overlaps(x_next, follower.x) else WAS_AHEAD
+                n_following -= 1
     for i in range(n):
         if path.follower[i].end == FOLLOWS:
             path.follower[i].end = NO_CRASH
@@ -225,41 +225,41 @@ def follow(n: int, drivers: RecordArray, cut: int, lead: int, until: int, path: 
 
 @compiled_inline
 def never_reaches(driver: Record, speed: float, ahead: float, slowest: float, steps: int) -> bool:
-    """Whether a driver stays behind even at full throttle from now on; BV is ``ahead`` (m), never below ``slowest``.
+    """Whether a driver stays behind BV even at full throttle; BV is ``ahead`` (m), and never below ``slowest`` (m/s).
 
-    The gap that is left is concave in time, so that its ends decide.
+    The gap is concave in time, so that it is smallest now or at the end.
     """
-    rest = steps * STEP_S
-    left = ahead + (slowest - speed) * rest - 0.5 * max(driver.max_acceleration_mps2, 0.0) * (rest * rest)
-    return ahead > SAFE_M and left > SAFE_M
+    time_s = steps * STEP_S
+    gap_then = ahead + (slowest - speed) * time_s - 0.5 * max(driver.max_acceleration_mps2, 0.0) * (time_s * time_s)
+    return ahead > SAFE_M and gap_then > SAFE_M
 
 
 @compiled_inline
 def who_crashes(followers: Followers, cut: int, lead: int, environment: Environment, path: Trajectory) -> int:
     """One bit for each attentive driver that runs into BV hard enough to count; see `follow`.
 
-    Of the envelope every crash counts: who stays behind it may be the harder for crashing later.
+    Every crash of the envelope counts: a driver behind it may crash later, and harder.
     """
     drivers, envelope, until = followers.drivers, followers.envelope, environment.numbers.max_steps
-    found = n = 0
+    crashes = n = 0
     if envelope >= 0:
         late = drivers[envelope].delay_steps
         take_over(0, envelope, drivers, late, True, cut, lead, environment, path)
         follow(1, drivers, cut, lead, until, path)
         if path.follower[0].end < 0:
             return 0
-        found = 1 << envelope
+        crashes = 1 << envelope
     for d in range(drivers.size):
         if d != envelope:
             take_over(n, d, drivers, drivers[d].delay_steps, False, cut, lead, environment, path)
             n += 1
     follow(n, drivers, cut, lead, until, path)
     for i in range(n):
-        one = path.follower[i]
+        follower = path.follower[i]
         above = followers.counts_above_mps
-        if one.end >= 0 and (above == 0.0 or one.v - path.v_after[one.end] > above):
-            found |= 1 << one.driver
-    return found
+        if follower.end >= 0 and (above == 0.0 or follower.v - path.v_after[follower.end] > above):
+            crashes |= 1 << follower.driver
+    return crashes
 
 
 @compiled_threads

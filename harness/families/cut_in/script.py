@@ -1,4 +1,4 @@
-"""What is to be known of a cut-in to repeat it, the motion that this is, and who else crashes on it."""
+"""The facts that are needed to repeat a cut-in, its motion, and which other drivers crash on it."""
 
 from __future__ import annotations
 
@@ -50,24 +50,27 @@ def script_of(traffic: Environment, chosen: Chosen) -> Script:
     facts, n, steps = chosen.facts, len(chosen.facts), int(traffic.numbers["max_steps"])
     x, v, lane = beginning(states_from(facts[name] for name in STATE_COLUMNS))
     lv, bv, n_lv, n_bv = (np.ascontiguousarray(facts[name]) for name in (*_LENGTHS, *_LENGTHS.values()))
-    told = unboxed(Maneuvers(lv, bv, n_lv, n_bv, chosen.lead))
+    maneuvers = unboxed(Maneuvers(lv, bv, n_lv, n_bv, chosen.lead))
     speed, lanes = np.zeros((n, steps, BV + 1)), np.full((n, steps, BV + 1), LEFT, np.int8)
-    _move(told, chosen.at, int(traffic.numbers["hold_steps"]), v, speed, lanes)
+    _move(maneuvers, chosen.at, int(traffic.numbers["hold_steps"]), v, speed, lanes)
     return natural_script(x, v, lane, speed, lanes, chosen.at, chosen.lead)
 
 
 @compiled_threads
-def _move(told: Maneuvers, cut: IntArray, hold_steps: int, v: FloatArray, speed: FloatArray, lanes: Int8Array) -> None:
+def _move(
+    maneuvers: Maneuvers, cut: IntArray, hold_steps: int, v: FloatArray, speed: FloatArray, lanes: Int8Array
+) -> None:
     for i in range(cut.size):
         v_lv, v_bv, a_lv, a_bv, used = v[i, LV], v[i, BV], 0.0, 0.0, 0
         for step in range(speed.shape[1]):
-            left, redraws = 0 <= cut[i] < step, step % hold_steps == 0
-            if redraws and step // hold_steps < told.n_lv[i]:
-                a_lv = acceleration(told.lv[i, step // hold_steps])
-            if left:
+            has_cut_in = 0 <= cut[i] < step
+            redraws = step % hold_steps == 0
+            if redraws and step // hold_steps < maneuvers.n_lv[i]:
+                a_lv = acceleration(maneuvers.lv[i, step // hold_steps])
+            if has_cut_in:
                 redraws = (step - cut[i] - 1) % hold_steps == 0
             if redraws:
-                a_bv = acceleration(told.bv[i, used]) if used < told.n_bv[i] else 0.0
+                a_bv = acceleration(maneuvers.bv[i, used]) if used < maneuvers.n_bv[i] else 0.0
                 used += 1
             if step == cut[i]:
                 used += 1  # the mark
@@ -93,13 +96,13 @@ def _drive(
     script: Script, start: FloatArray, environment: Environment, drivers: RecordArray, path: Trajectory, out: Driven
 ) -> None:
     """Drive others along cut-ins (n,); ``path`` is room to work in, and holds BV's motion of the last afterwards."""
-    most, motion = environment.numbers.max_steps, out.motion
-    path.slowest[:] = -math.inf  # nobody is let off before the end
+    max_steps, motion = environment.numbers.max_steps, out.motion
+    path.slowest[:] = -math.inf  # so that nobody is taken to stay behind BV before the end
     for i in range(start.shape[0]):
         cut, lead = script.at[i], script.lead[i]
         after = onset_of(cut, lead) + 1
         path.x[0], path.v[0] = script.x[i], script.v[i]
-        for step in range(most):
+        for step in range(max_steps):
             path.v[step + 1, BV], path.v[step + 1, AV] = script.speed[i, step, BV], path.v[0, AV]
             for vehicle in (BV, AV):
                 v, v_after = path.v[step, vehicle], path.v[step + 1, vehicle]
@@ -108,7 +111,7 @@ def _drive(
         if not math.isnan(start[i, 0]):
             path.x[after, AV], path.v[after, AV] = start[i]
         for d in range(drivers.size):
-            for until in range(after if motion.size > 0 else most, most + 1):
+            for until in range(after if motion.size > 0 else max_steps, max_steps + 1):
                 take_over(0, d, drivers, drivers[d].delay_steps, False, cut, lead, environment, path)
                 follow(1, drivers, cut, lead, until, path)
                 if motion.size > 0:

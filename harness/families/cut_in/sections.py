@@ -38,7 +38,7 @@ from harness.problems import broken_rule
 from harness.vocabulary import FloatArray
 
 SMALLEST_SHARE = 1e-12
-"""Of lane changes that are accepted."""
+"""Smallest share of wished lane changes carried out."""
 STEP = "acceptance_steps__share__"
 ONE_SIDED = 0.95
 """Quantile of a step's share that no replicate has drawn."""
@@ -157,13 +157,13 @@ LogHazards = Annotated[list[LogScale], _LENGTH]
 
 
 def _one_each(*pairs: tuple[str, str], beyond: str = "") -> Any:
-    """Validator of a section: a list for each pair (list, of) is as long as the other, but for one with one beyond."""
+    """Validator of a section: the lists of each pair are of the same length; the one ``beyond`` has one number more."""
 
     def checked(self: BaseModel) -> BaseModel:
-        for key, of in pairs:
-            numbers, wanted = getattr(self, key), len(getattr(self, of)) + (key == beyond)
-            if numbers is not None and len(numbers) != wanted:
-                expected = f"{wanted}, one for each of {of}" + " and one beyond" * (key == beyond)
+        for key, other in pairs:
+            numbers, length = getattr(self, key), len(getattr(self, other)) + (key == beyond)
+            if numbers is not None and len(numbers) != length:
+                expected = f"{length}, one for each of {other}" + " and one beyond" * (key == beyond)
                 mend = "Add what is missing, or delete what is too much."
                 raise broken_rule(key, f"{len(numbers)} numbers", expected, mend)
         return self
@@ -211,27 +211,27 @@ class AcceptanceSteps(Section):
         return [step for step, events in enumerate(self.events or ()) if not events and self.exposure is not None]
 
     def without_half(self) -> dict[int, dict[str, float]]:
-        """Numbers with which there are half as many events in each step without one."""
+        """For each step without an event: values with half its share."""
         return {step: {f"{STEP}{step}": 0.5 * self.share[step].value} for step in self.without_events}
 
     def as_if_unseen(self, row: Mapping[str, float]) -> dict[str, float]:
-        """A replicate with what zero events leave open upwards, in place of the draw that is right in the mean.
+        """A replicate (or {} for none) whose shares in steps without events are as high as zero events allow.
 
-        In all steps without events, whichever carry a vehicle's rate: so what is found serves others, too. Draws are of
-        (½)-gamma quantiles over the exposure; the same quantile of 1-gamma is what no event at all refuses.
+        Shares of replicates are drawn as gamma(½) over the exposure, which is right in the mean. In their place come
+        the same quantiles of gamma(1), the upper limit by zero events; without a draw the `ONE_SIDED` quantile.
         """
-        moved = dict(row)
+        unseen = dict(row)
         for step in self.without_events:
             name, exposure = f"{STEP}{step}", (self.exposure or ())[step]
             below = float(gammainc(0.5, row[name] * exposure)) if name in row else ONE_SIDED
-            moved[name] = min(float(gammaincinv(1.0, below)) / exposure, 1.0) if exposure > 0.0 else 1.0
-        return moved
+            unseen[name] = min(float(gammaincinv(1.0, below)) / exposure, 1.0) if exposure > 0.0 else 1.0
+        return unseen
 
-    def where(self, some: Collection[int]) -> str:
-        """Times to collision of steps, neighbours together: ``TTC < 2 s``, ``TTC 3 to 5 s``."""
+    def where(self, steps: Collection[int]) -> str:
+        """Times to collision of steps in words, neighbouring steps as one: ``TTC < 2 s``, ``TTC 3 to 5 s``."""
         ends = [0.0, *_values(self.ttc_s), math.inf]
-        low = [plain(ends[step]) for step in some if step - 1 not in some]
-        high = [plain(ends[step + 1]) for step in some if step + 1 not in some]
+        low = [plain(ends[step]) for step in steps if step - 1 not in steps]
+        high = [plain(ends[step + 1]) for step in steps if step + 1 not in steps]
         between = (f"TTC {a} to {b} s" if float(a) else f"TTC < {b} s" for a, b in zip(low, high, strict=True))
         return " and ".join(between).replace("to inf s", "s and more")
 

@@ -51,7 +51,7 @@ class Leaving(Section):
     _ranges = ordered(("careless_least_s", "careless_most_s"), equal=False)
 
     def lateral_mps(self) -> FloatArray:
-        """Speeds of leaving (m/s), equally probable ones."""
+        """Lateral speeds (m/s) at which the vehicle leaves, of equal probability."""
         quantiles = (np.arange(N_LATERAL) + 0.5) / N_LATERAL
         return np.asarray(self.lateral_median_mps.value * elementary.exp(self.lateral_log_sd.value * ndtri(quantiles)))
 
@@ -118,19 +118,20 @@ class CutOut(FollowingFamily):
 
     def told(self, facts: Mapping[str, Any]) -> str:
         speed = facts["revealed_speed_mps"]
-        what = f"one at {speed:.1f} m/s, {facts['closing_mps']:.1f} m/s slower" if speed > 0.0 else "one that stands"
-        return f"at {facts['lateral_speed_mps']:.1f} m/s sideways, and reveals {what}"
+        other = f"one at {speed:.1f} m/s, {facts['closing_mps']:.1f} m/s slower" if speed > 0.0 else "one that stands"
+        return f"at {facts['lateral_speed_mps']:.1f} m/s sideways, and reveals {other}"
 
     def facts_of(self, traffic: FollowingTraffic, events: RecordArray, speed_mps: FloatArray) -> dict[str, FloatArray]:
         clear_m, visible_m = (float(traffic.numbers[name]) for name in ("clear_m", "visible_from_m"))
-        clear = [0 if np.isnan(w) else seen_after(clear_m, w, NEVER) for w in events["lateral_mps"]]
-        seen = [c - seen_after(visible_m, w, c) if c else 0 for c, w in zip(clear, events["lateral_mps"], strict=True)]
+        lateral = events["lateral_mps"]
+        clear = [0 if np.isnan(w) else seen_after(clear_m, w, NEVER) for w in lateral]
+        visible = [c - seen_after(visible_m, w, c) if c else 0 for c, w in zip(clear, lateral, strict=True)]
         return {
             "revealed_speed_mps": events["ratio"] * speed_mps,
             "closing_mps": (1.0 - events["ratio"]) * speed_mps,
             "ttc_when_clear_s": events["ttc_s"],
             "lateral_speed_mps": events["lateral_mps"],
-            "visible_s": STEP_S * np.array(seen, np.float64),
+            "visible_s": STEP_S * np.array(visible, np.float64),
         }
 
 

@@ -1,4 +1,4 @@
-"""Motion that is prescribed where the AV follows: the vehicle ahead before and after the onset, and one it reveals."""
+"""Prescribed motion where the AV follows: of the vehicle ahead before and after the onset, and of one it reveals."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from harness.vocabulary import FloatArray, Int8Array, IntArray, Record, RecordAr
 
 AV_START_M = 100.0
 HOLD_STEPS = 10
-"""For which the vehicle ahead keeps a drawn acceleration."""
+"""Steps for which the vehicle ahead keeps a drawn acceleration."""
 LEAD, REVEALED = 0, 1
 PARKED_M = 3900.0
 """Where a vehicle stands that nothing reveals."""
@@ -61,7 +61,7 @@ def starts_from(numbers: Record, u: FloatArray) -> RecordArray:
 
 
 def drawn_accelerations(numbers: Record, seed: int, number: IntArray, speed_mps: FloatArray) -> Int8Array:
-    """Of the vehicle ahead in each second of the approaches (n, seconds), in steps of 0.2 m/s²."""
+    """Accelerations of the vehicle ahead in each second of the approaches (n, seconds), in units of 0.2 m/s²."""
     u = np.zeros((number.size, -(-int(numbers["onset"]) // HOLD_STEPS)))
     _fill(seed, number, u)
     t, v = special.stdtrit(float(numbers["free_driving__df"]), u), speed_mps.copy()
@@ -71,8 +71,8 @@ def drawn_accelerations(numbers: Record, seed: int, number: IntArray, speed_mps:
         w = (ahead - numbers["fit_range__v_centre_mps"]) / numbers["fit_range__v_scale_mps"]
         log_scale = numbers["free_driving__log_scale"] + numbers["free_driving__log_scale_u"] * w
         scale = elementary.exp(log_scale + numbers["free_driving__log_scale_uu"] * (w * w))
-        wanted = numbers["free_driving__location_mps2"] + scale * t[:, second]
-        a = np.clip(wanted, numbers["free_driving__lowest_mps2"], numbers["free_driving__highest_mps2"])
+        unlimited = numbers["free_driving__location_mps2"] + scale * t[:, second]
+        a = np.clip(unlimited, numbers["free_driving__lowest_mps2"], numbers["free_driving__highest_mps2"])
         drawn[:, second] = np.rint(a / _GRID_MPS2)
         for _ in range(HOLD_STEPS):
             v = np.maximum(v + drawn[:, second] * _GRID_MPS2 * STEP_S, 0.0)
@@ -99,16 +99,16 @@ def walk(speed_mps: float, accelerations: Int8Array, numbers: Record, motion: Mo
 
 @compiled_inline
 def happen(event: Record, until: int, numbers: Record, motion: Motion) -> int:
-    """What others do from the onset to a step; returns the step from which on the one ahead is off the lane."""
+    """Move the others from the onset ``until`` a step; returns the step from which on the one ahead is off the lane."""
     x, v, onset = motion.x, motion.v, numbers.onset
-    held, a, releases = 0, 0.0, False
+    n_held, a, releases = 0, 0.0, False
     for step in range(onset, until):
         if releases:
             a = min(0.0, a + event.jerk_mps3 * STEP_S)
         else:
             a = max(-event.peak_mps2, a - event.jerk_mps3 * STEP_S) if event.peak_mps2 > 0.0 else 0.0
-            held += a == -event.peak_mps2
-            releases = held >= max(event.held_s / STEP_S - 0.5, 1.0)
+            n_held += a == -event.peak_mps2
+            releases = n_held >= max(event.held_s / STEP_S - 0.5, 1.0)
         v[step + 1, LEAD] = next_speed(v[step, LEAD], a)
         x[step + 1, LEAD] = next_position(x[step, LEAD], v[step, LEAD], v[step + 1, LEAD])
     if math.isnan(event.ratio):
@@ -126,13 +126,13 @@ def happen(event: Record, until: int, numbers: Record, motion: Motion) -> int:
 
 @compiled_inline
 def in_scope(event: Record, speed_mps: float, numbers: Record) -> bool:
-    """Whether a follower at some headway has to brake harder than a limit: else the event is no danger to anyone.
+    """Whether a follower at the scope's headway has to brake harder than a limit: a milder event endangers nobody.
 
-    Nor harder than another one, where those are asked for that are milder than the ones in scope.
+    For tests of milder events alone there is an upper limit, too.
     """
     if math.isnan(event.ratio):
         return True
     closing = (1.0 - event.ratio) * speed_mps
     room = event.ttc_s * closing + numbers.scope_headway_s * speed_mps
-    asked = closing * closing
-    return bool(2.0 * numbers.scope_mps2 * room <= asked < 2.0 * numbers.below_mps2 * room)
+    closing_squared = closing * closing
+    return bool(2.0 * numbers.scope_mps2 * room <= closing_squared < 2.0 * numbers.below_mps2 * room)

@@ -1,6 +1,6 @@
-"""What families have in common in which the AV follows a vehicle from the start, and the traffic never looks at it.
+"""Base of families in which the AV follows a vehicle from the start, and the traffic never looks at it.
 
-So the probability of an event depends on no AV, and pools are exact for any. An event is one of a grid.
+So the probability of an event does not depend on the AV, and a pool is exact for any. An event is one of a grid.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from harness.compiled import unboxed
 from harness.families.flow import Flow
 from harness.families.following.approach import (
     AV_START_M,
+    HOLD_STEPS,
     START_DTYPE,
     FollowingTraffic,
     drawn_accelerations,
@@ -42,30 +43,30 @@ START_FACTS = (
 N_SPEEDS = 1024
 """Quantiles of the speed over which means are taken."""
 MILDEST_MPS2 = 0.5
-"""Braking that an event asks for: below this nothing is tested [assumed]."""
+"""Braking that an event needs: below this nothing is tested [assumed]."""
 
 
 class FollowingFamily(Family):
-    """A family says which parameters, vehicles and facts it has. When somebody sees an event its drivers know."""
+    """A family of this kind adds its parameters, vehicles and facts; drivers know from when on they see an event."""
 
     n_uniforms, follows, stand_ins = 2, True, STAND_INS
-    outside_kept = 2  # 39,000 to 45,000 tests without a crash say that a rate is below 0.3 of the competent driver's
+    outside_kept = 2  # 39,000 to 45,000 tests without a crash show that a rate is below 0.3 of the competent driver's
     model: type[FollowingParameters]
 
     def traffic(self, settings: EnvironmentSettings, parameters: FollowingParameters | None = None) -> FollowingTraffic:
-        given = parameters or self.parameters(settings)
-        values = given.values()
+        parameters = parameters or self.parameters(settings)
+        values = parameters.values()
         onset = round(values["approach__duration_s"] / STEP_S)
         steps = {"onset": onset, "max_steps": onset + round(values["approach__after_s"] / STEP_S)}
         clear = {name: values.get(f"leaving__{name}", math.nan) for name in ("clear_m", "visible_from_m")}
         scope = {name: values.get(f"leaving__{name}", 0.0) for name in ("scope_mps2", "scope_headway_s")}
         scope["below_mps2"] = math.inf
-        kernel = ("fit_range__", "initial_state__", "free_driving__", "approach__")
-        known = {name: value for name, value in values.items() if name.startswith(kernel)} | clear | scope
-        dtype = [*((name, "f8") for name in known), *((name, "i8") for name in steps)]
-        numbers = np.array([(*known.values(), *steps.values())], dtype)[0]
+        sections = ("fit_range__", "initial_state__", "free_driving__", "approach__")
+        kernel_numbers = {name: value for name, value in values.items() if name.startswith(sections)} | clear | scope
+        dtype = [*((name, "f8") for name in kernel_numbers), *((name, "i8") for name in steps)]
+        numbers = np.array([(*kernel_numbers.values(), *steps.values())], dtype)[0]
         Flow(numbers).require_sound(settings.parameters)
-        return FollowingTraffic(numbers, *given.grid())
+        return FollowingTraffic(numbers, *parameters.grid())
 
     def max_steps(self, traffic: FollowingTraffic) -> int:
         return int(traffic.numbers["max_steps"])
@@ -74,20 +75,22 @@ class FollowingFamily(Family):
         return float(np.nan_to_num(traffic.numbers["clear_m"]))
 
     def mean_speed_mps(self, traffic: FollowingTraffic) -> float:
-        """Of the vehicle ahead, as it approaches."""
-        nothing = self.choose(traffic, 0, _usual_paths(traffic), np.full(N_SPEEDS, -1))
-        speed = self._moved(traffic, nothing.facts)[1]
+        """Of the vehicle ahead, during the approach."""
+        uneventful = self.choose(traffic, 0, _usual_paths(traffic), np.full(N_SPEEDS, -1))
+        _, speed, _ = self._moved(traffic, uneventful.facts)
         return float(speed[:, : int(traffic.numbers["onset"]), 0].mean())
 
     def share_in_scope(self, traffic: FollowingTraffic) -> float:
         """Share of events that are in scope."""
-        found = self.events(traffic, 0, _usual_paths(traffic), Followers(driver_records([])))
-        return float(elementary.exp(found.log_any).mean())
+        events = self.events(traffic, 0, _usual_paths(traffic), Followers(driver_records([])))
+        return float(elementary.exp(events.log_any).mean())
 
     def exposure(self, traffic: FollowingTraffic, parameters: FollowingParameters) -> Exposure:
-        given, share = parameters.counted(), self.share_in_scope(traffic)
-        counted = given.counted and (given.counted[0], given.counted[1] / share)
-        return Exposure(given.per_hour * share, given.low * share, given.high * share, counted, given.source)
+        per_hour, share = parameters.counted(), self.share_in_scope(traffic)
+        counted = per_hour.counted and (per_hour.counted[0], per_hour.counted[1] / share)
+        return Exposure(
+            per_hour.per_hour * share, per_hour.low * share, per_hour.high * share, counted, per_hour.source
+        )
 
     def milder(self, traffic: FollowingTraffic) -> FollowingTraffic | None:
         if (scope := float(traffic.numbers["scope_mps2"])) <= MILDEST_MPS2:
@@ -109,33 +112,36 @@ class FollowingFamily(Family):
         stride: int = 1,
         offset: IntArray | None = None,
     ) -> Events:
-        n, grid = paths.number.size, traffic.grid.size
-        found = Events(np.zeros((n, grid)), np.zeros((n, grid), np.int64), np.zeros(n), np.zeros(n))
+        n, n_events, n_drivers = paths.number.size, traffic.grid.size, drivers.drivers.size
+        events = Events(np.zeros((n, n_events)), np.zeros((n, n_events), np.int64), np.zeros(n), np.zeros(n))
         first = np.zeros(n, np.int64) if offset is None else offset
         accelerations = drawn_accelerations(traffic.numbers, seed, paths.number, paths.start["speed_mps"])
-        room = empty_motion(traffic)
-        at, at_onset = np.zeros(drivers.drivers.size, DRIVING_DTYPE), np.zeros((drivers.drivers.size, STATE))
-        known = unboxed(traffic), unboxed(drivers), unboxed(room)
-        enumerate_events(paths.start, accelerations, stride, first, *known, at, at_onset, unboxed(found))
-        return found
+        given = unboxed(traffic), unboxed(drivers), unboxed(empty_motion(traffic))
+        now, at_onset = np.zeros(n_drivers, DRIVING_DTYPE), np.zeros((n_drivers, STATE))
+        enumerate_events(paths.start, accelerations, stride, first, *given, now, at_onset, unboxed(events))
+        return events
 
     def choose(
         self, traffic: FollowingTraffic, seed: int, paths: Paths, event: IntArray, *, of_pool: bool = True
     ) -> Chosen:
-        n, seconds = event.size, -(-int(traffic.numbers["onset"]) // 10)
+        onset = int(traffic.numbers["onset"])
+        seconds = -(-onset // HOLD_STEPS)
         lists = [("lead_accelerations", np.int8, (seconds,)), ("n_seconds", np.int64)]
         real = [(each.name, np.float64) for each in self.columns if each.kind == pa.float64()]
-        facts: RecordArray = np.zeros(n, np.dtype([*real, ("event", np.int64), *lists]))
+        facts: RecordArray = np.zeros(event.size, np.dtype([*real, ("event", np.int64), *lists]))
         facts["start_speed_mps"] = paths.start["speed_mps"]
         facts["natural_headway_s"] = paths.start["natural_headway_s"]
-        _, one, path = np.unique(paths.number, return_index=True, return_inverse=True)  # a pool has many events of each
-        drawn = drawn_accelerations(traffic.numbers, seed, paths.number[one], paths.start["speed_mps"][one])
-        facts["lead_accelerations"], facts["n_seconds"], facts["event"] = drawn[path], seconds, event
-        onset, events = int(traffic.numbers["onset"]), events_of(traffic, event)
-        facts["lead_speed_mps"] = self._moved(traffic, facts[one])[1][path, onset - 1, 0]
-        _, one, kind = np.unique(event, return_index=True, return_inverse=True)
-        clear = self._moved(traffic, facts[one])[2][kind]
-        for name, values in self.facts_of(traffic, events, facts["lead_speed_mps"]).items():
+        facts["n_seconds"], facts["event"] = seconds, event
+        # A pool has many events of each path: its motion is computed once.
+        _, first, path = np.unique(paths.number, return_index=True, return_inverse=True)
+        accelerations = drawn_accelerations(traffic.numbers, seed, paths.number[first], paths.start["speed_mps"][first])
+        facts["lead_accelerations"] = accelerations[path]
+        _, speed, _ = self._moved(traffic, facts[first])
+        facts["lead_speed_mps"] = speed[path, onset - 1, 0]
+        _, first, kind = np.unique(event, return_index=True, return_inverse=True)
+        _, _, clear_of_kind = self._moved(traffic, facts[first])
+        clear = clear_of_kind[kind]
+        for name, values in self.facts_of(traffic, events_of(traffic, event), facts["lead_speed_mps"]).items():
             facts[name] = np.where(event < 0, np.nan, values)
         lead = np.where(clear - onset < traffic.numbers["max_steps"], clear - onset - 1, 0)
         return Chosen(facts, np.where(event < 0, -1, onset + lead), np.where(event < 0, 0, lead))
@@ -147,10 +153,11 @@ class FollowingFamily(Family):
         return int(traffic.numbers["onset"])
 
     def facts_of(self, traffic: FollowingTraffic, events: RecordArray, speed_mps: FloatArray) -> dict[str, FloatArray]:
-        """Facts of the family's own, of events (n,) with a vehicle ahead at a speed: here those of its grid."""
+        """Facts of the family's own, of events (n,) behind a vehicle at a speed; by default the fields of the grid."""
         return {each.name: events[each.name] for each in self.columns if each.name in (EVENT_DTYPE.names or ())}
 
     def _moved(self, traffic: FollowingTraffic, facts: RecordArray) -> tuple[FloatArray, FloatArray, IntArray]:
+        """Motion of the others in tests (n,); see `move_others`."""
         n, others = len(facts), len(self.vehicles) - 1
         x, speed = np.zeros((n, others)), np.zeros((n, self.max_steps(traffic), others))
         clear = np.zeros(n, np.int64)
@@ -184,11 +191,11 @@ class FollowingFamily(Family):
     def drive(
         self, traffic: FollowingTraffic, chosen: Chosen, start: FloatArray, drivers: RecordArray, *, last: bool = False
     ) -> Driven:
-        steps, facts = self.max_steps(traffic), chosen.facts  # whoever follows has done so from the start
+        steps, facts = self.max_steps(traffic), chosen.facts  # (not ``start``: a follower drives from the beginning)
         end, tracks = np.zeros((len(facts), len(drivers)), np.int64), np.zeros((len(drivers), steps + 1, 2))
         room = empty_motion(traffic)
-        at = np.zeros(len(drivers), DRIVING_DTYPE)
-        drive_others(_tests(traffic, facts), unboxed(traffic), drivers, unboxed(room), at, tracks, end)
+        now = np.zeros(len(drivers), DRIVING_DTYPE)
+        drive_others(_tests(traffic, facts), unboxed(traffic), drivers, unboxed(room), now, tracks, end)
         ahead = np.stack((room.x[:, self.principal], room.v[:, self.principal]), axis=1)
         return Driven(end, tracks if last else np.zeros((0, 0, 0)), ahead if last else np.zeros((0, 0)))
 
@@ -197,8 +204,8 @@ def _tests(traffic: FollowingTraffic, facts: RecordArray) -> Tests:
     """Tests (n,) by their facts, for kernels."""
     start: RecordArray = np.zeros(len(facts), START_DTYPE)
     start["speed_mps"], start["natural_headway_s"] = facts["start_speed_mps"], facts["natural_headway_s"]
-    drawn = np.ascontiguousarray(facts["lead_accelerations"])
-    return unboxed(Tests(start, drawn, events_of(traffic, facts["event"])))
+    accelerations = np.ascontiguousarray(facts["lead_accelerations"])
+    return unboxed(Tests(start, accelerations, events_of(traffic, facts["event"])))
 
 
 def events_of(traffic: FollowingTraffic, number: IntArray) -> RecordArray:

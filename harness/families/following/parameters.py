@@ -30,7 +30,7 @@ from harness.vocabulary import FloatArray, RecordArray
 ROAD_S = 55.0
 """Longest test: the road is 4 km long, and vehicles drive 40 m/s and more."""
 ROUNDED = 0.02
-"""By how much a rate may differ from events over hours [assumed]: as both are rounded."""
+"""Relative difference allowed between a rate and events over hours, as both are rounded [assumed]."""
 EVENT_DTYPE = np.dtype(
     [
         ("peak_mps2", np.float64),  # how hard the vehicle ahead brakes
@@ -46,13 +46,13 @@ NO_EVENT = np.array((0.0, 0.0, np.inf, np.nan, np.nan, np.nan), EVENT_DTYPE)
 
 
 def grid_of(**laws: tuple[FloatArray, FloatArray]) -> tuple[RecordArray, FloatArray]:
-    """Events (E,) and their probabilities, of fields with ``laws`` of their own: values and probabilities of each."""
+    """Events (E,) and their probabilities, from independent ``laws`` of their fields: values and probabilities each."""
     grid: RecordArray = np.full([values.size for values, _ in laws.values()], NO_EVENT, EVENT_DTYPE)
     share: FloatArray = np.ones(1)
     for axis, (name, (values, probabilities)) in enumerate(laws.items()):
-        others = tuple(range(1, len(laws) - axis))
-        grid[name] = np.expand_dims(values, others)
-        share = share * np.expand_dims(probabilities, others)
+        later_axes = tuple(range(1, len(laws) - axis))
+        grid[name] = np.expand_dims(values, later_axes)
+        share = share * np.expand_dims(probabilities, later_axes)
     return grid.ravel(), share.ravel()
 
 
@@ -80,7 +80,7 @@ class Approach(Section):
 
 
 class Counted(Section):
-    """How many events there are in an hour of driving: of ``events`` in ``hours``, where they were counted."""
+    """How many events there are in an hour of driving; ``events`` in ``hours`` if they were counted."""
 
     per_hour: Annotated[Number, within(*EXPOSURES)]
     events: Annotated[int, Field(ge=1)] | None = None
@@ -99,7 +99,7 @@ class Counted(Section):
 
 
 class FollowingParameters(ParameterFile):
-    """All numbers of such a family; how probable which events are says `grid`."""
+    """All numbers of such a family; `grid` gives its events with their probabilities."""
 
     fit_range: FitRange
     initial_state: SpeedsAndGaps

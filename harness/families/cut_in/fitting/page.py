@@ -56,16 +56,9 @@ def page(fit: Fit, tally: BesideCounts, noise_mps2: float, request: FitRequest, 
     """The page; ``noise_mps2`` is the sd of accelerations by measurement, ``others`` is what other families found."""
     template = templates(__package__).get_template("fit.html.j2")
     html = template.render(
-        fit=fit,
-        tally=tally,
-        asked=request,
-        plots=list(_plots(fit)),
-        bins=list(_bins(fit)),
-        numbers=list(_numbers(fit)),
-        noise_mps2=noise_mps2,
-        others=others,
-        base=BASE,
-    )
+        fit=fit, tally=tally, asked=request, plots=list(_plots(fit)), bins=list(_bins(fit)),
+        numbers=list(_numbers(fit)), noise_mps2=noise_mps2, others=others, base=BASE,
+    )  # fmt: skip
     return printable(html)
 
 
@@ -182,9 +175,8 @@ def _hazard_plot(fit: Fit) -> Plot:
         per_1000_s = np.maximum(time_s, 1e-9) / 1000.0
         low, high = _limits(seen, per_1000_s)
         top = 1.1 * float(max(high.max(), (wished / per_1000_s).max()))
-        panel = PlotPanel(
-            "", PlotAxis(label, float(edges[0]), float(edges[-1])), PlotAxis("lane changes per 1,000 s", 0.0, top)
-        )
+        y = PlotAxis("lane changes per 1,000 s", 0.0, top)
+        panel = PlotPanel("", PlotAxis(label, float(edges[0]), float(edges[-1])), y)
         _add_limits(panel, edges, low, high, "seen, 90 % limits")
         panel.add("line", "blue", middle, wished / per_1000_s, label="fitted")
         panels.append(panel)

@@ -1,6 +1,6 @@
-"""What NADE keeps of the K tests that run side by side, and of those that are over.
+"""State of NADE: of the K tests that run side by side, and of those that are over.
 
-Beside the loop's own `harness.loop.cells`, from whose records it takes a cell's row and step.
+The loop's own state is in `harness.loop.cells`; from its records come a cell's row and step.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ MOMENT_DTYPE = np.dtype(
     + [(name, _f8) for name in (*STATE_COLUMNS, "p", "q_sampled")]
 )
 CONTROL_STEPS = 16
-"""Of a test, for which a shard has room at first; more is made where they are more."""
+"""Control steps of a test for which a shard has room at first; it is doubled when it is used up."""
 
 
 class Drawn(NamedTuple):
@@ -95,24 +95,26 @@ def empty_nade(
     states: RecordArray, n_cells: int, environment: Environment, importance: Importance, moment_limit: int
 ) -> NadeKernel:
     """Room for the tests (n,) that begin in ``states``, of which K run side by side."""
-    n, n_surrogates, capacity = len(states), importance.n_surrogates, CONTROL_STEPS * len(states) + n_cells
+    n, n_surrogates, n_functions = len(states), importance.n_surrogates, importance.alpha.size
+    capacity = CONTROL_STEPS * n + n_cells
     _, hold_steps, n_draws = lengths(environment)
-    cutting, staying = np.zeros((2, n_cells, hold_steps, n_surrogates))
     n_lv, n_bv = np.zeros((2, n), np.int64)
-    log_q, martingale = np.zeros((n, importance.alpha.size)), np.zeros((n, n_surrogates))
     lv_path, bv_path = np.zeros((2, n, n_draws), np.int8)
     moment_q, moment_v = np.zeros((2, capacity, n_surrogates))
+    log_q, martingale = np.zeros((n, n_functions)), np.zeros((n, n_surrogates))
     moments = np.zeros(capacity, MOMENT_DTYPE), moment_q, moment_v, np.zeros(1, np.int64), moment_limit
-    q, challenge = np.zeros((2, n_surrogates))
-    q_acceleration, ratio = np.zeros((n_surrogates, N_ACCELERATIONS)), np.zeros(importance.alpha.size)
-    scratch = np.zeros(N_ACCELERATIONS), q, q_acceleration, challenge, ratio, empty_trajectory(environment)
-    running = np.zeros(n_cells, CELL_DTYPE), cutting, staying
     drawn = Drawn(n_lv, n_bv, log_q, martingale, lv_path, bv_path, *moments)
-    return NadeKernel(states, *running, drawn, Scratch(*scratch), environment, importance)
+    q, challenge = np.zeros((2, n_surrogates))
+    p, ratio = np.zeros(N_ACCELERATIONS), np.zeros(n_functions)
+    q_acceleration = np.zeros((n_surrogates, N_ACCELERATIONS))
+    scratch = Scratch(p, q, q_acceleration, challenge, ratio, empty_trajectory(environment))
+    cells = np.zeros(n_cells, CELL_DTYPE)
+    cut_challenge, stay_challenge = np.zeros((2, n_cells, hold_steps, n_surrogates))
+    return NadeKernel(states, cells, cut_challenge, stay_challenge, drawn, scratch, environment, importance)
 
 
 def with_more_room(drawn: Drawn) -> Drawn:
     """The same with room for twice as many control steps."""
-    old = drawn.moment, drawn.moment_q, drawn.moment_v
-    moment, moment_q, moment_v = (np.concatenate([each, np.zeros_like(each)]) for each in old)
+    arrays = drawn.moment, drawn.moment_q, drawn.moment_v
+    moment, moment_q, moment_v = (np.concatenate([array, np.zeros_like(array)]) for array in arrays)
     return drawn._replace(moment=moment, moment_q=moment_q, moment_v=moment_v)

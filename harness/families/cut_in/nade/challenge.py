@@ -56,13 +56,13 @@ LONG = 1000
 
 @compiled_inline
 def lags(driver: Record) -> bool:
-    """Whether what a driver does follows from more than what it sees in that step."""
+    """Whether what a driver does depends on more than what it sees in that step."""
     return bool(driver.kind < 0 or driver.delay_steps > 0 or driver.max_jerk_mps3 < math.inf)
 
 
 @compiled_inline
 def acts(driver: Record, memory: Memory, step: int, speed: float, lead_speed: float, r2: float) -> Memory:
-    """What a surrogate does in a step after the cut-in, as what it remembers."""
+    """Memory of a surrogate, with its acceleration, in a step after the cut-in."""
     acting = step - driver.delay_steps
     return memory if acting < 0 else react(driver, memory, acting, speed, lead_speed, r2)
 
@@ -148,7 +148,7 @@ def build_after_cut_in(environment: Environment, driver: RecordArray) -> tuple[F
 def induced(
     environment: Environment, after: Float32Array, late: Float32Array | None = None
 ) -> tuple[Float32Array, Float32Array]:
-    """The same by the states ``after`` a hold period (v, R2, R2dot, 31, 3), and after a first one if it is ``late``."""
+    """The same, from the states ``after`` a hold period (v, R2, R2dot, 31, 3); ``late`` after the first, if it lags."""
     points, shape, hold = points_of(AFTER), AFTER.shape, int(environment.numbers["hold_steps"])
     at_speeds = np.pad(points.speed[:, None], ((0, 0), (0, 2)))  # R1 and R1dot do not matter
     pmf = evaluate_laws(environment, at_speeds).pmf[laws.FREE_DRIVING]
@@ -243,9 +243,9 @@ def build_immediate(environment: Environment, driver: RecordArray) -> tuple[Floa
     maneuvers = np.empty((*shape, N_ACCELERATIONS), np.float32)
 
     def at_speed(i: int) -> None:
-        here = slice(i, i + 1)
-        part = points._replace(speed=points.speed[here])
-        roll_out(driver, hold, level_steps(hold), part, value[:, here], maneuvers[here], least[:, here])
+        row = slice(i, i + 1)
+        points_of_row = points._replace(speed=points.speed[row])
+        roll_out(driver, hold, level_steps(hold), points_of_row, value[:, row], maneuvers[row], least[:, row])
 
     with ThreadPoolExecutor(usable_cpus()) as threads:  # one surrogate may take as long as all others together
         list(threads.map(at_speed, range(points.speed.size)))

@@ -1,7 +1,7 @@
-"""What LV and BV do in tests whose cut-in is drawn in the loop: their maneuvers in every step.
+"""Maneuvers of LV and BV in every step of tests whose cut-in is drawn in the loop.
 
 Accelerations are drawn at hold clocks, the cut-in in every step, by importance functions where a moment is critical.
-What that is worth: `likelihood_ratio`.
+Their likelihood ratios are in `likelihood_ratio`.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ def decide(kernel: KernelState, nade: NadeKernel, placed: int) -> None:
 
 @compiled
 def finish(kernel: KernelState, nade: NadeKernel, n: int) -> None:
-    """Write what the ``n`` tests weigh that have just ended to their rows."""
+    """Write the weights of the ``n`` tests that have just ended to their rows."""
     for i in range(n):
         k, row = kernel.cells.ended[i], kernel.cells.ended_row[i]
         log_sampled = nade.cell[k].log_sampled
@@ -102,7 +102,7 @@ def redraw_free(k: int, period: int, state: State, kernel: KernelState, nade: Na
 
 @compiled_inline
 def add_to_path(row: int, maneuver: int, nade: NadeKernel) -> None:
-    """What BV does from now on in the test of a row."""
+    """Append a maneuver of BV to the path of a row's test."""
     nade.drawn.bv_path[row, nade.drawn.n_bv[row]] = maneuver
     nade.drawn.n_bv[row] += 1
 

@@ -29,10 +29,10 @@ from harness.vocabulary import BoolArray, Float32Array, FloatArray, read_only
 class Importance(NamedTuple):
     """All that kernels need to sample critical moments.
 
-    What may be so or not is 0 or 1. ``recursive`` says which challenge; ``mixes_episodes`` whether one importance
-    function is drawn per episode, or all are mixed in every critical step. ``n_surrogates`` is 0 where nobody is asked;
-    ``n_forced`` is 1 where the forced cut-in is importance function 0: surrogates follow after it.
-    ``steps_per_level`` lie between two levels of ``value``.
+    Flags are 0 or 1. ``recursive`` says which challenge is used, ``mixes_episodes`` whether one importance function is
+    drawn per episode (else all are mixed in every critical step). ``n_surrogates`` is 0 without importance functions of
+    surrogates; ``n_forced`` is 1 where importance function 0 is the forced cut-in, and those of surrogates come after
+    it. ``steps_per_level`` lie between two levels of ``value``.
     ``alpha`` (M,) are the mixture weights. ``value`` (J, levels + 1, v, R2, R2dot), ``maneuvers`` (J, v, R2, R2dot, 31)
     and ``before`` (J, redraw times + 1, v, R2, R2dot) are the challenge tables (see `tables`).
     ``harmless`` (J, levels + 1, v - 1, R2 - 1, R2dot - 1) marks the grid cells after the cut-in in which no
@@ -83,9 +83,9 @@ def harmless_cells(tables: Tables, *, recursive: bool) -> BoolArray:
 
     By remaining time, (J, levels + 1, v - 1, R2 - 1, R2dot - 1); with the longest that of the maneuvers' own table.
     """
-    at, maneuvers = tables.value if recursive else tables.least, tables.maneuvers
-    cells: BoolArray = at == 0.0 if recursive else at > CONTACT_M + _ROUNDING_M
-    cells[:, -1] = maneuvers.max(-1) == 0.0 if recursive else maneuvers.min(-1) > CONTACT_M + _ROUNDING_M
+    safe_m = CONTACT_M + _ROUNDING_M
+    cells: BoolArray = tables.value == 0.0 if recursive else tables.least > safe_m
+    cells[:, -1] = tables.maneuvers.max(-1) == 0.0 if recursive else tables.maneuvers.min(-1) > safe_m
     for axis in (2, 3, 4):
         n = cells.shape[axis]
         cells = cells.take(range(n - 1), axis) & cells.take(range(1, n), axis)
@@ -143,9 +143,9 @@ def look_ahead(
         if r2 > 0.0 and period < importance.before.shape[1]:
             later = interpolate(importance.before[j, period], where_end)
         for i in range(hold - 1, -1, -1):
-            here = stay_challenge[i, j]
+            this_step = stay_challenge[i, j]
             stay_challenge[i, j] = later
-            later += here
+            later += this_step
 
 
 @compiled_inline
@@ -178,7 +178,7 @@ def propose_cut_in(
 
 @compiled_inline
 def challenges_nobody(state: State, level: int, importance: Importance) -> bool:
-    """Whether a state after the cut-in is seen to be uncritical without a look at any acceleration.
+    """Whether a state after the cut-in is known to be uncritical without evaluating any acceleration.
 
     ``level`` is the `remaining_level` of the test.
     """

@@ -31,17 +31,17 @@ MOMENT_LIMITS = {"all": 32767, "first_9": 9, "none": 0}
 class DrawnInLoop(Traffic):
     """LV and BV in tests that begin in ``states`` (n,); ``moment_limit`` control steps are kept of each.
 
-    When the tests are over ``drawn`` says what happened in them.
+    When the tests are over, ``drawn`` holds what was drawn in them.
     """
 
     def __init__(
         self, states: RecordArray, environment: Environment, importance: Importance, moment_limit: int = 0
     ) -> None:
-        n, nowhere = len(states), np.full(len(states), -1)
-        nothing = np.zeros((n, 0, BV + 1)), np.zeros((n, 0, BV + 1), np.int8)
-        start, steps = beginning(states), int(environment.numbers["max_steps"])
-        script = natural_script(*start, *nothing, nowhere, np.zeros(n, np.int64))
-        super().__init__(script._replace(n_steps=np.full(n, steps)), states)
+        n = len(states)
+        speed, lanes = np.zeros((n, 0, BV + 1)), np.zeros((n, 0, BV + 1), np.int8)  # they are drawn in the loop
+        script = natural_script(*beginning(states), speed, lanes, np.full(n, -1), np.zeros(n, np.int64))
+        n_steps = np.full(n, int(environment.numbers["max_steps"]))
+        super().__init__(script._replace(n_steps=n_steps), states)
         self._given = states, environment, importance, moment_limit
 
     def rows(self, rows: slice) -> DrawnInLoop:
@@ -74,7 +74,7 @@ class DrawnInLoop(Traffic):
 
 
 class InLoop(Source):
-    """``tables`` are challenges, where surrogates' importance functions are mixed."""
+    """``tables`` are those of challenges; None without importance functions of surrogates."""
 
     columns = (*EPISODE_COLUMNS, "log_q", "martingale")
     kernel = staticmethod(decide)
@@ -90,8 +90,8 @@ class InLoop(Source):
         self.importance = build_importance(self.campaign, self.tables)
 
     def _build_of(self, surrogate: str) -> Callable[..., Tables]:
-        if (asked := self.campaign.testing.own_challenge) is not None:
-            return own_challenge(asked)
+        if (own := self.campaign.testing.own_challenge) is not None:
+            return own_challenge(own)
         code = self.campaign.own_surrogates.get(surrogate)
         return build_one if code is None else own_surrogate(code, f"surrogates.{surrogate}")
 

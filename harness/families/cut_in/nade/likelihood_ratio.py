@@ -1,4 +1,4 @@
-"""What a test is worth: the likelihood ratio of what happened in it, naturalistic over sampled.
+"""The weight of a test: the likelihood ratio of what happened in it, naturalistic over sampled.
 
 **The weight of an episode** is p/q_sampled; what is kept is its logarithm. Per importance function j the logarithm
 L_j = Σ log(q_j/p) over the control steps so far is kept. The probability that a step was sampled with, *given the
@@ -12,7 +12,8 @@ adds its ratios (`record_lane`, `record_acceleration`); `decide.finish` writes t
 
 **What surrogates predicted** is summed up beside it: W_t C_j(s_t, a_t) − W_{t−1} V_j(s_t) over control steps, W being
 the weight so far. Given the shared history its mean is 0 in every step, whatever the surrogate is, since q_sampled can
-draw whatever has a challenge: a martingale whose known mean is a control variate (`harness.estimators.doubly_robust`).
+draw every maneuver that has a challenge. So the sum is a martingale, with a known mean: a control variate
+(`harness.estimators.doubly_robust`).
 """
 
 from __future__ import annotations

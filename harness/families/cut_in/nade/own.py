@@ -2,10 +2,10 @@
 
     function(driver, v_bv_mps, gap_m, gap_rate_mps, acceleration_mps2, remaining_s) -> array in [0, 1]
 
-says how critical it is for a driver behind BV that BV holds an acceleration for a hold period from here. It is asked at
-the points of the grid, in arrays that broadcast, and tabulated as a recursive challenge is; what not cutting in is
-worth follows from it. A model, which is a batch controller, is put behind BV in the same states and driven for a hold
-period, as if it had just been made. Either steers alone: likelihood ratios are of what is drawn, whatever it says.
+says how critical it is for a driver behind BV that BV holds an acceleration for a hold period from here. It is called
+at the points of the grid, with arrays that broadcast, and tabulated like a recursive challenge; the challenge of not
+cutting in follows from it. A model, which is a batch controller, is put behind BV in the same states, newly made, and
+driven for a hold period. Either one only steers what is drawn: likelihood ratios are exact whatever it returns.
 """
 
 from __future__ import annotations
@@ -31,9 +31,9 @@ WHERE = "testing.challenge"
 
 
 def own_challenge(name: str) -> Callable[[Environment, RecordArray, str], Tables]:
-    """What builds tables of one surrogate (`tables.build_one`) by the function of that ``name``.
+    """Builder of the tables of one surrogate (like `tables.build_one`), by the function of that ``name``.
 
-    It raises a `CampaignError` where there is no such function, or where what it gives are no challenges.
+    It raises a `CampaignError` if there is no such function, or if it returns anything but challenges.
     """
 
     def build(environment: Environment, driver: RecordArray, _: str) -> Tables:
@@ -44,24 +44,25 @@ def own_challenge(name: str) -> Callable[[Environment, RecordArray, str], Tables
         for i, speed in enumerate(points_of(AFTER).speed):
             gap, rate = np.meshgrid(*points_of(AFTER)[1:], indexing="ij")
             for level in range(1, LEVELS + 1):
-                value[level, i] = _asked(name, function, numbers, speed, gap, rate, 0.0, level * per_level_s)
+                value[level, i] = _call(name, function, numbers, speed, gap, rate, 0.0, level * per_level_s)
             states = speed, gap[..., None], rate[..., None], ACCELERATIONS_MPS2
-            maneuvers[i] = _asked(name, function, numbers, *states, LEVELS * per_level_s)
+            maneuvers[i] = _call(name, function, numbers, *states, LEVELS * per_level_s)
         return recursive_tables(environment, value, maneuvers)
 
     return build
 
 
-def _asked(name: str, function: Callable[..., Any], *given: Any) -> Any:
-    shape, mend = np.broadcast_shapes(*map(np.shape, given[1:])), "Fix the function; numpy's clip limits."
+def _call(name: str, function: Callable[..., Any], *arguments: Any) -> Any:
+    shape = np.broadcast_shapes(*map(np.shape, arguments[1:]))
+    mend = "Fix the function; numpy's clip limits."
     try:
-        found = np.broadcast_to(np.asarray(function(*given), np.float64), shape)
+        challenges = np.broadcast_to(np.asarray(function(*arguments), np.float64), shape)
     except (Exception, SystemExit) as error:
         raise CampaignError(WHERE, f"{name}: {cause_of(error)}", f"challenges of shape {shape}", mend) from error
-    if not ((found >= 0.0) & (found <= 1.0)).all():
-        wrong = found[~((found >= 0.0) & (found <= 1.0))][0]
-        raise CampaignError(WHERE, f"{name}, which gives {wrong:g}", "challenges from 0 to 1", mend)
-    return found
+    wrong = challenges[~((challenges >= 0.0) & (challenges <= 1.0))]
+    if wrong.size:
+        raise CampaignError(WHERE, f"{name}, which gives {wrong[0]:g}", "challenges from 0 to 1", mend)
+    return challenges
 
 
 def own_surrogate(name: str, where: str) -> Callable[[Environment, RecordArray, str], Tables]:
@@ -72,15 +73,15 @@ def own_surrogate(name: str, where: str) -> Callable[[Environment, RecordArray, 
 
     def build(environment: Environment, _driver: RecordArray, _challenge: str) -> Tables:
         expected = "a batch controller, which is made without arguments (docs/controllers.md)"
-        made, after = own_code(name, where, expected), np.empty((*AFTER.shape, N_ACCELERATIONS, 3), np.float32)
-        if not hasattr(made, "step_batch"):
+        model_class, after = own_code(name, where, expected), np.empty((*AFTER.shape, N_ACCELERATIONS, 3), np.float32)
+        if not hasattr(model_class, "step_batch"):
             mend = "It is asked for millions of states at once: write step_batch(seen)."
             raise CampaignError(where, f"{name}, which has no step_batch", expected, mend)
         points, hold = points_of(AFTER), int(environment.numbers["hold_steps"])
         gap, rate, bv = (each.ravel() for each in np.meshgrid(*points[1:], ACCELERATIONS_MPS2, indexing="ij"))
         try:
             for i, speed in enumerate(points.speed):
-                after[i] = states_after(made(), speed, gap, rate, bv, hold).reshape(after.shape[1:])
+                after[i] = states_after(model_class(), speed, gap, rate, bv, hold).reshape(after.shape[1:])
         except (Exception, SystemExit) as error:
             raise CampaignError(where, f"{name}: {cause_of(error)}", expected, "Fix the class.") from error
         return recursive_tables(environment, *induced(environment, after))
@@ -95,26 +96,26 @@ def states_after(
 
     BV begins with one ``speed`` (m/s), gaps (m), gap rates (m/s) and accelerations ``bv`` (m/s²) are (n,).
     """
-    lead, own, gap = np.full(gap.size, speed), np.maximum(speed - rate, 0.0), gap.copy()
-    none, cell = np.broadcast_to(0.0, gap.size), read_only(np.arange(gap.size))
-    set_speed, unknown, right = read_only(own.copy()), np.broadcast_to(np.nan, gap.size), np.zeros_like(cell)
-    asked, lost = np.zeros(gap.size), np.zeros(gap.size, np.bool_)
+    lead, follower, gap = np.full(gap.size, speed), np.maximum(speed - rate, 0.0), gap.copy()
+    zeros, cell = np.broadcast_to(0.0, gap.size), read_only(np.arange(gap.size))
+    set_speed, unknown, right = read_only(follower.copy()), np.broadcast_to(np.nan, gap.size), np.zeros_like(cell)
+    commanded, collided = np.zeros(gap.size), np.zeros(gap.size, np.bool_)
     if begin := getattr(model, "start_batch", None):
         begin(cell, cell, [np.random.default_rng(0)] * gap.size)
     for step in range(steps):
-        seen = BatchObservation(
-            cell=cell, episode=cell, time_s=np.broadcast_to(step * STEP_S, gap.size), position_m=none,
-            speed_mps=read_only(own), acceleration_mps2=read_only(asked), gap_m=read_only(gap),
+        observation = BatchObservation(
+            cell=cell, episode=cell, time_s=np.broadcast_to(step * STEP_S, gap.size), position_m=zeros,
+            speed_mps=read_only(follower), acceleration_mps2=read_only(commanded), gap_m=read_only(gap),
             lead_speed_mps=read_only(lead), bv_position_m=read_only(gap + VEHICLE_LENGTH_M), bv_speed_mps=lead,
-            bv_lane=right, lv_position_m=unknown, lv_speed_mps=unknown, lv_lane=right, bv_lateral_m=none,
-            bv_lateral_speed_mps=none, bv_overlaps=right + 1, set_speed_mps=set_speed, lv_lateral_m=none,
-            lv_lateral_speed_mps=none,
+            bv_lane=right, lv_position_m=unknown, lv_speed_mps=unknown, lv_lane=right, bv_lateral_m=zeros,
+            bv_lateral_speed_mps=zeros, bv_overlaps=right + 1, set_speed_mps=set_speed, lv_lateral_m=zeros,
+            lv_lateral_speed_mps=zeros,
         )  # fmt: skip
-        asked = np.array(np.broadcast_to(np.asarray(model.step_batch(seen), np.float64), gap.shape))
-        if not np.isfinite(asked).all():
-            raise ValueError(f"an acceleration of {asked[~np.isfinite(asked)][0]}")
-        lead_after, own_after = np.maximum(lead + bv * STEP_S, 0.0), np.maximum(own + asked * STEP_S, 0.0)
-        gap = gap + 0.5 * (lead + lead_after - own - own_after) * STEP_S
-        lead, own = lead_after, own_after
-        lost |= gap < CONTACT_M
-    return np.stack([np.where(lost, COLLIDED, lead), gap, lead - own], axis=1)
+        commanded = np.array(np.broadcast_to(np.asarray(model.step_batch(observation), np.float64), gap.shape))
+        if not np.isfinite(commanded).all():
+            raise ValueError(f"an acceleration of {commanded[~np.isfinite(commanded)][0]}")
+        lead_after, follower_after = np.maximum(lead + bv * STEP_S, 0.0), np.maximum(follower + commanded * STEP_S, 0.0)
+        gap = gap + 0.5 * (lead + lead_after - follower - follower_after) * STEP_S
+        lead, follower = lead_after, follower_after
+        collided |= gap < CONTACT_M
+    return np.stack([np.where(collided, COLLIDED, lead), gap, lead - follower], axis=1)

@@ -42,7 +42,7 @@ class Tables(NamedTuple):
 
 
 def tables_name(environment: Environment, drivers: RecordArray, challenge: str) -> str:
-    """What the tables of a set of surrogates are kept under; the level of lane changing is not among it."""
+    """Name of the tables of a set of surrogates in the cache; they do not depend on the level of lane changing."""
     numbers = {name: value for name, value in environment.content().items() if name != "level"}
     surrogates = drivers.dtype.names, drivers.tolist()
     content = json.dumps([_FORMAT, challenge, numbers, AFTER, BEFORE, surrogates, LEVELS], sort_keys=True)
@@ -73,7 +73,7 @@ def build_one(environment: Environment, driver: RecordArray, challenge: str) -> 
 
 
 def recursive_tables(environment: Environment, value: Float32Array, maneuvers: Float32Array) -> Tables:
-    """Tables of one surrogate by a challenge after the cut-in; what precedes it follows."""
+    """Tables of one surrogate by a challenge after the cut-in; that before it follows from it."""
     return Tables(value, maneuvers, build_before_cut_in(environment, value), _NONE)
 
 
@@ -86,8 +86,8 @@ def build_tables(
 ) -> Tables:
     """Tables of all surrogates, ``drivers`` (J,), read-only, from the cache if they are there.
 
-    ``challenge`` is ``recursive`` or ``immediate``, or what is to be known of the user's own that ``builds`` tabulate;
-    ``done`` is called with the number of those that have become ready.
+    ``challenge`` is ``recursive`` or ``immediate``, or identifies the user's own, which ``builds`` tabulate. ``done``
+    is called with the number of tables that have become ready.
     """
     name = tables_name(environment, drivers, challenge)
     if (path := cache.find(name)) is not None:
