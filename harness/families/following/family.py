@@ -86,11 +86,9 @@ class FollowingFamily(Family):
         return float(elementary.exp(events.log_any).mean())
 
     def exposure(self, traffic: FollowingTraffic, parameters: FollowingParameters) -> Exposure:
-        per_hour, share = parameters.counted(), self.share_in_scope(traffic)
-        counted = per_hour.counted and (per_hour.counted[0], per_hour.counted[1] / share)
-        return Exposure(
-            per_hour.per_hour * share, per_hour.low * share, per_hour.high * share, counted, per_hour.source
-        )
+        rate, share = parameters.counted(), self.share_in_scope(traffic)
+        counted = rate.counted and (rate.counted[0], rate.counted[1] / share)
+        return Exposure(rate.per_hour * share, rate.low * share, rate.high * share, counted, rate.source)
 
     def milder(self, traffic: FollowingTraffic) -> FollowingTraffic | None:
         if (scope := float(traffic.numbers["scope_mps2"])) <= MILDEST_MPS2:

@@ -73,10 +73,11 @@ def own_surrogate(name: str, where: str) -> Callable[[Environment, RecordArray, 
 
     def build(environment: Environment, _driver: RecordArray, _challenge: str) -> Tables:
         expected = "a batch controller, which is made without arguments (docs/controllers.md)"
-        model_class, after = own_code(name, where, expected), np.empty((*AFTER.shape, N_ACCELERATIONS, 3), np.float32)
+        model_class = own_code(name, where, expected)
         if not hasattr(model_class, "step_batch"):
             mend = "It is asked for millions of states at once: write step_batch(seen)."
             raise CampaignError(where, f"{name}, which has no step_batch", expected, mend)
+        after = np.empty((*AFTER.shape, N_ACCELERATIONS, 3), np.float32)
         points, hold = points_of(AFTER), int(environment.numbers["hold_steps"])
         gap, rate, bv = (each.ravel() for each in np.meshgrid(*points[1:], ACCELERATIONS_MPS2, indexing="ij"))
         try:
