@@ -29,7 +29,7 @@ from harness.campaign.sections import DEFAULT, DEFAULT_FAMILY, Section
 from harness.campaign.vehicle import AV_SOURCES, Panel
 from harness.campaign.yaml_text import read_yaml, yaml_text
 from harness.errors import CampaignError
-from harness.families import family_named
+from harness.families import families, family_named
 from harness.files import real_path
 from harness.problems import did_you_mean, file_meant, listed
 
@@ -77,11 +77,16 @@ def load_campaign(
     folder = Path(path).parent
     campaign = _with_real_paths(campaign, place, folder if of_file else Path.cwd(), check_files=check_files)
     if check_files:
-        shipped = family_named(campaign.scenario, place(("scenario",))).shipped
+        own = family_named(campaign.scenario, place(("scenario",)))
         for i, family in enumerate(campaign.scenarios or ()):
             family_named(family, place(("scenarios", i)))
-        if campaign.environment.parameters != DEFAULT:
-            shipped_or_own(campaign.environment.parameters, shipped, place(("environment", "parameters")))
+        if (name := campaign.environment.parameters) != DEFAULT:
+            where = place(("environment", "parameters"))
+            for other in families().values():
+                if other.shipped != own.shipped and (other.shipped / f"{name}.yaml").is_file():
+                    mend = f"Write --set environment.parameters={own.default_parameters}, or leave it out."
+                    raise CampaignError(where, f"'{name}', of {other.name}", f"traffic of {own.name}", mend)
+            shipped_or_own(name, own.shipped, where)
         for family, file in campaign.environments.items():
             shipped_or_own(file, family_named(family).shipped, place(("environments", family)))
     env = campaign.run.ray.runtime_env

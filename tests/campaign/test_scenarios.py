@@ -229,3 +229,8 @@ def test_aliases_that_multiply_are_refused_at_once(read, first, more, levels):
     lines = [f"a{i}: &a{i} {more.format(name)}" for i, name in enumerate(names) if i]
     with pytest.raises(CampaignError, match=r"some\.yaml:\d+:\d+: found more than 100,000 values, or 50 levels"):
         read("\n".join([f"a0: &a0 {first}", *lines]))
+
+
+def test_traffic_of_another_scenario_is_told_which_to_write():
+    with pytest.raises(CampaignError, match=r"of cut_in; expected traffic of lead_brakes.*parameters=lead-brakes-1"):
+        load_campaign(FOLDER / "smoke.yaml", ["scenario=lead_brakes"])
