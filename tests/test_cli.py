@@ -19,9 +19,9 @@ from harness.cli import main
 from harness.commands.options import run_folder
 from harness.commands.printing import say
 from harness.errors import EXIT_REFUTED, RunFolderError, TooManyFailedError
+from harness.families import family_named
 from harness.progress import Progress
 from harness.report.words import run_lines
-from harness.vehicles.library import OF_TRAFFIC
 from tests.golden.campaigns import BASE, RUNS
 from tests.in_process import one_process, without_page
 from tests.stored_runs import SCENARIOS, copy_of, estimates, golden, manifest, sets
@@ -45,7 +45,7 @@ def test_check_prints_a_campaign_file(capsys, tmp_path, monkeypatch):
     output = capsys.readouterr().out
     (tmp_path / "resolved.yaml").write_text(output)
     resolved = load_campaign(tmp_path / "resolved.yaml")
-    assert resolved == load_campaign(SMOKE, ["stop.rhw=0.2", f"pool.library={OF_TRAFFIC[True]}"])
+    assert resolved == load_campaign(SMOKE, ["stop.rhw=0.2", f"pool.library={family_named('cut_in').ladders[True]}"])
     assert main(["check", SMOKE, "--json"]) == 0
     output = json.loads(capsys.readouterr().out)
     assert output["stop"] == {**output["stop"], "rhw": 0.3, "episodes": 400_000}

@@ -42,7 +42,6 @@ class DoublyRobust(Nade):
         self._cubes: FloatArray = np.zeros((FOLDS, 1, 1, 1))
 
     def add(self, block: Block) -> None:
-        """Add the episodes of one block."""
         super().add(block)
         rows = np.column_stack([np.ones(len(block)), block.weighted_crashes(), block.martingale])
         cubes = np.broadcast_to(self._cubes, (FOLDS, *[rows.shape[1]] * 3))

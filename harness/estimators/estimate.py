@@ -150,7 +150,6 @@ class FailureBounds:
         self._worst: Accumulator | None = None  # until a test fails it would be the same
 
     def add(self, block: Block) -> None:
-        """Add the episodes of one block."""
         if self._worst is None and block.failed.any():
             self._worst = deepcopy(self.seen)
         self._n_failed += int(np.count_nonzero(block.failed))

@@ -74,7 +74,6 @@ class OwnState(Nade):
         self._own = self._call(deepcopy, self._call(estimator.make))  # as it will be once a test has failed
 
     def add(self, block: Block) -> None:
-        """Add the episodes of one block."""
         super().add(block)
         self._call(self._own.add, block)
 
@@ -111,7 +110,6 @@ class Diagnostics:
         self._ratios = defaultdict[int, Moments](Moments)
 
     def add(self, block: Block) -> None:
-        """Add one block."""
         weights, contact = block.weights(), block.outcome == CONTACT
         self._drawn = block.drawn
         self.n += len(block)

@@ -68,7 +68,6 @@ class Impacts:
         self._n = 0
 
     def add(self, block: Block) -> None:
-        """Add the episodes of one block."""
         self._n += len(block)
         crash = block.crash
         weight = np.asarray(block.stratum if block.drawn.shells is not None else np.exp(block.log_weight), np.float64)

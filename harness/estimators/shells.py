@@ -155,7 +155,6 @@ class SeenShells:
         self.tally = self.cells.joined(design.joined)
 
     def add(self, block: Block) -> None:
-        """Count one block."""
         design, crash = block.drawn.shells, block.crash
         assert design is not None
         if not self.cells.tests.size:

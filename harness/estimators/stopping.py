@@ -25,7 +25,7 @@ from harness.campaign.sections import MIN_CRASHES, Accept, Stop
 from harness.estimators.estimate import Estimate, Note, finite_json, note
 from harness.estimators.likelihood import Level
 from harness.estimators.limits import clopper_pearson
-from harness.estimators.pairs import PairDecision, Pairs, PairVerdict
+from harness.estimators.pairs import PairDecision, Pairs
 from harness.estimators.per_hour import PerHour
 from harness.estimators.shells import SeenShells
 from harness.numbers import two_digits_up
@@ -325,7 +325,8 @@ class PairRule(Rule):
         """Whether to stop at the end of a round."""
         watched = pairs.within(self._statement)
         level = Level.two_sided(self._confidence)
-        self.decision = replace(self.decision, verdict=self._verdict(watched))
+        verdict = watched.verdict(self.decision.margin or 0.0, self._level(watched))
+        self.decision = replace(self.decision, verdict=verdict)
         if self.decision.margin is not None and watched.n_crashes:
             _, low, high = watched.ratio(self._level(watched))
             self.decision = replace(self.decision, ratio=(1.0 / high, 1.0 / low if low > 0.0 else math.inf))
@@ -357,9 +358,6 @@ class PairRule(Rule):
         if watched.n_crashes and not self.ends_at_rhw:
             return self.level_at(watched.expected(watched.larger_rate), self._confidence)
         return Level.two_sided(self._confidence)
-
-    def _verdict(self, watched: Pairs) -> PairVerdict:
-        return watched.verdict(self.decision.margin or 0.0, self._level(watched))
 
     def _both_below(self, watched: Pairs) -> bool:
         """Whether both are known to crash less than so many times as often as the reference driver does at least."""

@@ -113,7 +113,6 @@ class Nade:
         self._largest_y = self._design_cap = self._log_cap = -math.inf
 
     def add(self, block: Block) -> None:
-        """Add the episodes of one block."""
         weights = np.exp(block.log_weight[block.crash])
         self.n += len(block)
         self.n_crashes += len(weights)

@@ -151,9 +151,9 @@ class EpisodeLoop:
             if self._av is not None:
                 self._av.require_untouched()
 
-    def beside(self, world: World | None = None, keep: RecordPolicy | None = None) -> EpisodeLoop:
-        """Another loop with the same AV, in a world of no more cells, or with other records."""
-        return EpisodeLoop(world or self._world, self._scenario, keep or self._keep, self._av)
+    def beside(self, keep: RecordPolicy | None = None) -> EpisodeLoop:
+        """Another loop with the same AV and world, or one with other records."""
+        return EpisodeLoop(self._world, self._scenario, keep or self._keep, self._av)
 
     @property
     def construction_s(self) -> list[float]:

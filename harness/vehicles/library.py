@@ -19,8 +19,7 @@ from harness.vehicles.drivers import MOST_FOLLOWERS, Followers, driver_records
 from harness.vocabulary import RecordArray
 
 SHIPPED_FOLDER = Path(__file__).parent
-OF_TRAFFIC = {False: "ladder-2", True: "ladder-lateral-1"}
-"""Shipped library by whether cut-ins take time."""
+DEFAULT = "ladder-2"
 
 
 def library_records(models: Sequence[Surrogate], see_onset: bool) -> RecordArray:
@@ -141,4 +140,4 @@ def load_library(name: str | None) -> Library:
 
     Raises `CampaignError`: names every place that is wrong.
     """
-    return read_model(shipped_or_own(name or OF_TRAFFIC[False], SHIPPED_FOLDER, "pool.library"), Library)
+    return read_model(shipped_or_own(name or DEFAULT, SHIPPED_FOLDER, "pool.library"), Library)

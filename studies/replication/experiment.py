@@ -13,9 +13,10 @@ from harness.campaign.drivers import BuiltInParameters
 from harness.campaign.models import parse_override, read_model
 from harness.campaign.sections import Positive, Section, Whole
 from harness.campaign.vehicle import AutomatedVehicle
+from harness.families.cut_in.family import CUT_IN
 from harness.families.cut_in.loading import load_environment
 from harness.problems import NAME_PATTERN, broken_rule
-from harness.vehicles.library import OF_TRAFFIC, load_library
+from harness.vehicles.library import load_library
 from harness.vocabulary import SAMPLING, EstimatorName
 from studies.chains.chain import CHAINS
 
@@ -169,6 +170,6 @@ def load_experiment(path: Path, overrides: Sequence[str] = ()) -> Experiment:
     """
     experiment = read_model(path, Experiment, [parse_override(text) for text in overrides])
     shows = load_environment(experiment.campaign.environment).lateral.present
-    library = experiment.campaign.pool.library or OF_TRAFFIC[shows]
+    library = experiment.campaign.pool.library or CUT_IN.ladders[shows]
     load_library(library)
     return experiment.replaced(("campaign", "pool", "library"), library)

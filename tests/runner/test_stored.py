@@ -206,7 +206,7 @@ def opens_below(folder):
 def inputs_in(folder, name):
     """Files of one's own that a golden campaign may be run from, and its overrides."""
     campaign = golden(name)
-    drivers = campaign.pool.library or library.OF_TRAFFIC[False]
+    drivers = campaign.pool.library or library.DEFAULT
     shutil.copy(BASE, folder / "campaign.yaml")
     shutil.copy(SHIPPED_FOLDER / f"{campaign.environment.parameters}.yaml", folder / "traffic.yaml")
     shutil.copy(library.SHIPPED_FOLDER / f"{drivers}.yaml", folder / "drivers.yaml")

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
 from collections.abc import Mapping
 from typing import Any
 
@@ -80,12 +78,6 @@ class CutIn(Family):
         except (CampaignError, ValueError):
             return None
         return environment
-
-    def digest(self, traffic: Environment) -> str:
-        numbers = traffic.content()
-        if (lateral := traffic.lateral).present:
-            numbers["lateral"] = [lateral.distance_m, lateral.cumulative.tolist()]
-        return hashlib.sha256(json.dumps(numbers, sort_keys=True).encode()).hexdigest()[:24]
 
     def max_steps(self, traffic: Environment) -> int:
         return int(traffic.numbers["max_steps"])

@@ -70,7 +70,7 @@ class Environment(NamedTuple):
     accepted: FloatArray
 
     def content(self) -> dict[str, Any]:
-        """All numbers but those of the lateral motion, for hashes; tables only where they are."""
+        """All numbers but those of the lateral motion, for a hash; tables only where they are."""
         tables = {**self.wish._asdict(), "accepted": self.accepted}
         numbers = {name: self.numbers[name].item() for name in self.numbers.dtype.names or ()}
         return numbers | {name: table.tolist() for name, table in tables.items() if table.size}
