@@ -21,6 +21,8 @@ import numpy as np
 from benchmarks.contenders import SCENARIOS
 from harness.campaign.campaign import Campaign
 from harness.campaign.files import load_campaign
+from harness.estimators.shells import SeenShells
+from harness.estimators.stopping import RoundRule
 from harness.pool.build import campaign_pool
 from harness.pool.shells import design_shells
 from harness.resolved import resolve
@@ -50,14 +52,14 @@ def drawn_pool(campaign: Campaign) -> DrawnPool:
 def rounds_of(campaign: Campaign, pool: DrawnPool, rng: np.random.Generator) -> list[list[int]]:
     """Tests of each shard of each round until the stop rule is content."""
     available = np.full(pool.design.p.size, campaign.pool.events_per_shell, np.int64)
-    planner = ShellRounds(campaign, pool.design, available)
+    planner, seen = ShellRounds(campaign, pool.design, available, RoundRule(campaign)), SeenShells(pool.design)
     rounds, enough = [], False
-    while not enough and (added := planner.next_round()).any():
-        tests = planner.seen.tally.tests
+    while not enough and (added := planner.next_round(seen)[0]).any():
+        tests = seen.tally.tests
         specs = round_requests(tests, added, 0, int(tests.sum()), campaign.run.smallest_shard)
         rounds.append([spec.n_episodes for spec in specs])
-        pool.count(added, planner.seen, rng)
-        enough = planner.enough_after(int(added.sum()))
+        pool.count(added, seen, rng)
+        enough = planner.rule.observe(seen)
     return rounds
 
 

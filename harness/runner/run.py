@@ -161,8 +161,7 @@ def _run(
         progress.stage("tests of all scenarios", None, done=n_held)
         while np.concatenate(added_by_family := rounds.next_round(hour)).any():
             for part, added in zip(hour.families, added_by_family, strict=True):
-                for shard in runs[part.family].drive_added(part.tally.tests, added, rule):
-                    part.seen.add(shard.block if campaign.accept is None else shard.block.cut_off_as_failed())
+                runs[part.family].drive_round(part.seen, added, rule)
             if rule.observe(hour) and not any(underway.run.is_behind for underway in runs.values()):
                 break
         for underway in runs.values():

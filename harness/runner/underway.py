@@ -9,7 +9,6 @@ from collections.abc import Iterable, Iterator, Mapping
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import asdict, dataclass, replace
 from functools import partial
-from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +18,8 @@ from harness.errors import EXIT_BUDGET_SPENT, EXIT_DONE, EXIT_REFUTED, CampaignE
 from harness.estimators import answer
 from harness.estimators.one_pass import even
 from harness.estimators.pairs import PairDecision, PairVerdict
-from harness.estimators.stopping import Decision, Rule, Verdict
+from harness.estimators.shells import SeenShells
+from harness.estimators.stopping import Decision, RoundRule, Rule, Verdict
 from harness.files import remove_unfinished
 from harness.pool.moved import assumed
 from harness.pool.shells import PrescribedEpisodes
@@ -35,8 +35,8 @@ from harness.resolved import Resolved
 from harness.runner import kept
 from harness.runner.workers import LocalWorkers, ShardResult, Workers
 from harness.sampling import paths, prepare
-from harness.sampling.protocol import ShardRequest
-from harness.sampling.shells import Shells, round_requests
+from harness.sampling.protocol import KnownTests, ShardRequest
+from harness.sampling.shells import ShellRounds, Shells, round_requests
 from harness.shown import ShownInPython
 from harness.signals import uninterrupted
 from harness.strata import STORED_DESIGN
@@ -138,12 +138,31 @@ class Underway:
         # A run to a precision or to a decision does not know its number of tests.
         total = campaign.stop.episodes if campaign.accept is None and campaign.stop.rhw is None else None
         self.progress.stage(f"tests{self.crew.where}", total, done=n_held)
-        rounds = self.run.source.rounds(n_held)
-        for shard in chain.from_iterable(self.drive(requests, rounds.rule) for requests in rounds):
-            if rounds.enough(shard.block):
-                break
+        if campaign.sampling.strata:
+            rule: Rule = self._drive_rounds(RoundRule(campaign, n_held))
+        else:
+            known = KnownTests(campaign)
+            rule = known.rule
+            for shard in self.drive(known, rule):
+                if known.enough(shard.block):
+                    break
         self.require_tests()
-        return rounds.rule
+        return rule
+
+    def _drive_rounds(self, rule: RoundRule) -> RoundRule:
+        seen, available = SeenShells(self.prescribed.design), self.prescribed.available
+        rounds = ShellRounds(self.run.resolved.campaign, seen.design, available, rule)
+        while (added := rounds.next_round(seen)[0]).any():
+            self.drive_round(seen, added, rule)
+            if rule.observe(seen):
+                break
+        return rule
+
+    def drive_round(self, seen: SeenShells, added: IntArray, rule: Rule) -> None:
+        """Drive the tests of a round, ``added`` (S,) to those ``seen``; to a limit those cut off may have crashed."""
+        for shard in self.drive_added(seen.tally.tests, added, rule):
+            decides = self.run.resolved.campaign.accept is not None
+            seen.add(shard.block.cut_off_as_failed() if decides else shard.block)
 
     def drive(self, requests: Iterable[ShardRequest], rule: Rule) -> Iterator[ShardResult]:
         """Drive shards and yield them in order, each once it is added to the run."""

@@ -1,4 +1,4 @@
-"""What the runner knows of a way of drawing tests: the class `Source`, its rounds of tests, and when they are enough.
+"""What the runner knows of a way of drawing tests: the class `Source`; and when tests known beforehand are enough.
 
 What holds for the way itself is an attribute of the class and is asked before anything is built; an instance holds what
 the tests of one campaign are drawn from.
@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from itertools import chain, pairwise
-from typing import Any, ClassVar, Protocol
+from typing import Any, ClassVar
 
 import numpy as np
 import pyarrow as pa
@@ -20,7 +20,7 @@ from harness.controllers.find import build_host
 from harness.controllers.hosts import BeforeTest
 from harness.estimators.block import EPISODE_COLUMNS, Block, block_from_tables
 from harness.estimators.one_pass import accumulator, headline_of
-from harness.estimators.stopping import Rule, StopRule
+from harness.estimators.stopping import StopRule
 from harness.families.protocol import Paths, Recorded
 from harness.loop.judge import judge
 from harness.loop.loop import EpisodeLoop, RecordPolicy, Shard
@@ -54,22 +54,8 @@ class ShardRequest:
         return slice(self.first_episode, self.first_episode + self.n_episodes)
 
 
-class Rounds(Protocol):
-    """Requests in rounds; the next round is asked for once all tests of the last one are added. ``rule`` ends them."""
-
-    rule: Rule
-
-    def __iter__(self) -> Iterator[Iterator[ShardRequest]]:
-        """Requests of each round."""
-
-    def enough(self, block: Block) -> bool:
-        """Add the tests of the next shard; True when the campaign is to stop."""
-
-
-class KnownRounds(Rounds):
-    """One round of tests that are all known beforehand; a stop rule looks at the end of some of their shards."""
-
-    rule: StopRule
+class KnownTests:
+    """Tests that are all known beforehand, shard by shard; a stop rule looks at the end of some of these."""
 
     def __init__(self, campaign: Campaign) -> None:
         self._total, self._confidence = campaign.stop.episodes, campaign.stop.confidence
@@ -78,11 +64,12 @@ class KnownRounds(Rounds):
         self.rule = StopRule(campaign.stop, [end for end in self._ends if end >= least])
         self._sums, self._n_episodes = accumulator(headline_of(campaign)), 0
 
-    def __iter__(self) -> Iterator[Iterator[ShardRequest]]:
+    def __iter__(self) -> Iterator[ShardRequest]:
         edges = enumerate(pairwise(chain((0,), self._ends)))
-        yield (ShardRequest(index, first, min(end, self._total) - first) for index, (first, end) in edges)
+        return (ShardRequest(index, first, min(end, self._total) - first) for index, (first, end) in edges)
 
     def enough(self, block: Block) -> bool:
+        """Add the tests of the next shard; True when the campaign is to stop."""
         self._sums.add(block)
         self._n_episodes += len(block)
         if not self.rule.due(self._n_episodes):
@@ -142,10 +129,6 @@ class Source:
         """What the campaign asks to be recorded of its tests, or with other ``traces``."""
         settings = self.campaign.records
         return RecordPolicy(traces or settings.traces, settings.trace_share)
-
-    def rounds(self, held: int) -> Rounds:  # noqa: ARG002 - only rounds that give up ask for it
-        """Rounds of tests, for a folder that holds ``held`` of them already."""
-        return KnownRounds(self.campaign)
 
     def run(self, loop: EpisodeLoop, request: ShardRequest) -> Shard:
         """Run the tests of a shard."""

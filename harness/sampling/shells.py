@@ -9,7 +9,7 @@ be continued to a smaller RHW.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import pairwise
@@ -21,7 +21,7 @@ import pyarrow as pa
 
 from harness.campaign.campaign import Campaign
 from harness.campaign.sections import ShellSettings
-from harness.estimators.block import EPISODE_COLUMNS, SHELL_COLUMNS, Block
+from harness.estimators.block import EPISODE_COLUMNS, SHELL_COLUMNS
 from harness.estimators.likelihood import Level, spread
 from harness.estimators.limits import clopper_pearson
 from harness.estimators.pairs import FAILED, Pairs
@@ -38,7 +38,7 @@ from harness.pool.vehicle_pool import baseline_paths_name, campaign_baseline_pat
 from harness.progress import Progress
 from harness.records.folder import SHELLS, read_as
 from harness.resolved import Resolved
-from harness.sampling.protocol import Rounds, ShardRequest, Source
+from harness.sampling.protocol import ShardRequest, Source
 from harness.strata import ASSUMPTION_FREE, LIBRARY_STATEMENT, ShellDesign
 from harness.vocabulary import FloatArray, IntArray
 
@@ -108,9 +108,6 @@ class Shells(Source):
     def begin_after(self, runs: Recorded) -> None:
         assert self.baseline_paths is not None
         self._draw_from(vehicle_pool(self.resolved, self.baseline_paths, runs))
-
-    def rounds(self, held: int) -> ShellRounds:
-        return ShellRounds(self.campaign, self.prescribed.design, self.prescribed.available, held)
 
     def run(self, loop: EpisodeLoop, request: ShardRequest) -> Shard:
         return self._run(loop, request.first_episode, *self.prescribed.rows(request.draws))
@@ -238,45 +235,19 @@ class Allocation:
         return spread(weights, lower, upper, LEVEL, size, room)
 
 
-class ShellRounds(Rounds):
-    """Rounds of shells' tests: takes finished tests in order, says what is tested next, and when it is enough.
+class ShellRounds:
+    """Rounds of tests of one pool, of whose strata ``available`` (S,) are the most tests; ``rule`` looks at each."""
 
-    ``available`` (S,) are the most tests of each stratum; for ``held`` see `RoundRule`. ``seen`` are the tests so far;
-    where a limit is decided, those that were cut off count as possible crashes.
-    """
-
-    rule: RoundRule
-
-    def __init__(self, campaign: Campaign, design: ShellDesign, available: IntArray, held: int = 0) -> None:
-        self.rule = RoundRule(campaign, held)
-        self._campaign = campaign
+    def __init__(self, campaign: Campaign, design: ShellDesign, available: IntArray, rule: RoundRule) -> None:
+        self.rule, self._budget = rule, campaign.stop.episodes
         self._allocation = Allocation.of(campaign.testing.shells, design, available)
-        self.seen = SeenShells(design)
-        self._n_episodes = self._look = 0
 
-    def __iter__(self) -> Iterator[Iterator[ShardRequest]]:
-        n_shards, size = 0, self._campaign.run.smallest_shard
-        while (added := self.next_round()).any():
-            requests = round_requests(self.seen.tally.tests, added, n_shards, self._n_episodes, size)
-            n_shards += len(requests)
-            yield iter(requests)
-
-    def next_round(self) -> IntArray:
-        """Tests to add per stratum, shape (S,); all 0 when no stratum or no budget is left."""
-        tally = self.seen.tally
-        added = self._allocation.next_round(tally, self._campaign.stop.episodes - self._n_episodes)
+    def next_round(self, seen: SeenShells) -> list[IntArray]:
+        """Tests to add per stratum, shape (S,), after all that were ``seen``; 0 when none or no budget is left."""
+        tally = seen.tally
+        added = self._allocation.next_round(tally, self._budget - int(tally.tests.sum()))
         self.rule.of_first_tests = self._allocation.is_first(tally.tests, added)
-        self._look = self._n_episodes + int(added.sum())
-        return added
-
-    def enough(self, block: Block) -> bool:
-        self.seen.add(block if self._campaign.accept is None else block.cut_off_as_failed())
-        return self.enough_after(len(block))
-
-    def enough_after(self, n: int) -> bool:
-        """Whether testing can end, once the next ``n`` tests are in ``seen``."""
-        self._n_episodes += n
-        return self._n_episodes == self._look and self.rule.observe(self.seen)
+        return [added]
 
 
 class SideBySide:

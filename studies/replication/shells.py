@@ -184,20 +184,20 @@ def looks(
     smaller round in its place: that is a look, too. What both rounds have in common is tested once.
     """
     available = drawn.available(campaign)
-    planner = ShellRounds(campaign, drawn.design, available)
+    planner, seen = ShellRounds(campaign, drawn.design, available, RoundRule(campaign)), SeenShells(drawn.design)
     allocation = Allocation.of(campaign.testing.shells, drawn.design, available)
-    while (added := planner.next_round()).any():
-        before, left = planner.seen.tally, added
+    while (added := planner.next_round(seen)[0]).any():
+        before, left = seen.tally, added
         n = int(before.tests.sum())
         for budget in budgets:
             if n < budget < n + added.sum():
                 last = np.maximum(allocation.next_round(before, budget - n) - (added - left), 0)
-                drawn.count(np.minimum(last, left), planner.seen, rng)
-                drawn.count(np.maximum(last - left, 0), spent := deepcopy(planner.seen), rng)
+                drawn.count(np.minimum(last, left), seen, rng)
+                drawn.count(np.maximum(last - left, 0), spent := deepcopy(seen), rng)
                 left = np.maximum(left - last, 0)
                 yield spent, planner, False
-        drawn.count(left, planner.seen, rng)
-        yield planner.seen, planner, planner.enough_after(int(added.sum()))
+        drawn.count(left, seen, rng)
+        yield seen, planner, planner.rule.observe(seen)
 
 
 class FormerRule(RoundRule):
@@ -295,13 +295,14 @@ class ShellCampaign(_Drawn):
     def _estimate(self, replication: int, drawn: DrawnPool, rng: np.random.Generator) -> Iterator[Row]:
         design = drawn.design
         rule, within = RoundRule(self.campaign.replaced(_STATEMENT, LIBRARY_STATEMENT)), None
-        for _, planner, enough in looks(self.campaign, drawn, rng):
-            pending = within is None and planner.seen.tally.tests.any()
-            if pending and rule.observe(planner.seen) and rule.look.stopped:
-                within = self._statement_row(planner.seen, replication, reached=True)
+        for seen, planner, enough in looks(self.campaign, drawn, rng):
+            pending = within is None and seen.tally.tests.any()
+            if pending and rule.observe(seen) and rule.look.stopped:
+                within = self._statement_row(seen, replication, reached=True)
+            reached = planner.rule.look.stopped
             if enough:
                 break
-        estimate, reached = planner.seen.result(self.campaign.stop.confidence), planner.rule.look.stopped
+        estimate = seen.result(self.campaign.stop.confidence)
         outside = int(estimate.details["within"]["n_crashes_outside"])
         row = estimate_row(FREE, replication, estimate, reached=reached, outside=outside)
         yield row
@@ -314,10 +315,10 @@ class ShellCampaign(_Drawn):
             beyond = replace(row, result=name, crash_rate=rate, std_error=error, ci_low=0.0, ci_high=bound)
             yield beyond
             if self.siblings:
-                part = planner.seen.tally.part(slice(first, None))
+                part = seen.tally.part(slice(first, None))
                 former = former_bound(design.p[first:], part, self.campaign.stop.confidence)
                 yield replace(beyond, result=name + FORMER, ci_high=former)
-        yield within or self._statement_row(planner.seen, replication, reached=False)
+        yield within or self._statement_row(seen, replication, reached=False)
         for reference in design.references:
             yield from _reference_rows(estimate, reference.name, replication, reached=reached)
 

@@ -21,7 +21,7 @@ from harness.estimators.limits import skewed_distances
 from harness.estimators.one_pass import one_pass
 from harness.estimators.scv import MixtureCv, Scv
 from harness.estimators.weighted import Nade
-from harness.sampling.protocol import KnownRounds
+from harness.sampling.protocol import KnownTests
 from studies.case_study.theorems import small_chains
 from studies.chains.chain import CHAINS, DECISIVE, PANEL, REPLAYED, Chain, decisive, enumerate_episodes, overtaking
 from studies.chains.sampler import Sampler, draw, with_optimal_function
@@ -317,7 +317,7 @@ def test_it_is_refused_below_the_tests_from_which_on_it_covers():
 def test_where_it_answers_it_is_refused_before_a_test_and_looked_at_from_there_on():
     asked = ["testing={method: episode_mixture, estimator: dr}", "environment.parameters=ndd-overtaking-1"]
     small = ["run.shard_size=100", "stop={rhw: 0.5, below_reference: null, episodes: 1999}"]
-    assert KnownRounds(load_campaign("idm", [*asked, *small])).rule.looks[0] == LEAST_TESTS["dr"]
+    assert KnownTests(load_campaign("idm", [*asked, *small])).rule.looks[0] == LEAST_TESTS["dr"]
     with pytest.raises(CampaignError, match=r"stop\.episodes.*999, with testing\.estimator dr.*at least 1,000"):
         load_campaign("idm", [*asked, *small, "stop.episodes=999"])
     with pytest.raises(CampaignError, match=r"dr, with 999 tests.*--resume"):  # of a run that was interrupted

@@ -13,6 +13,7 @@ from harness.estimators.block import Block, SamplingPlan, joined
 from harness.estimators.one_pass import one_pass
 from harness.estimators.severity import SPEEDS_MPS, Impacts
 from harness.estimators.shells import SeenShells
+from harness.estimators.stopping import RoundRule
 from harness.loop.loop import EpisodeLoop, RecordPolicy
 from harness.pool.build import campaign_pool
 from harness.resolved import resolve
@@ -93,8 +94,9 @@ def campaign_of(source, crashed, impact, rows, rng):
     """One campaign to its own precision, its tests drawn from the cut-ins of each stratum with replacement."""
     campaign = golden("shells-twin", "stop.rhw=0.4", "stop.episodes=20000", "testing.shells.first_tests=20")
     design = source.design.without_references()
-    rounds, sums = ShellRounds(campaign, design, np.full(design.p.size, 20_000)), Impacts(SeenShells)
-    while (added := rounds.next_round()).any():
+    rounds = ShellRounds(campaign, design, np.full(design.p.size, 20_000), RoundRule(campaign))
+    seen, sums = SeenShells(design), Impacts(SeenShells)
+    while (added := rounds.next_round(seen)[0]).any():
         stratum = np.repeat(np.arange(added.size), added)
         chosen = np.concatenate([rng.choice(rows[s], k) for s, k in enumerate(added.tolist()) if k])
         n, crash = stratum.size, crashed[chosen]
@@ -103,11 +105,10 @@ def campaign_of(source, crashed, impact, rows, rng):
             "cell_mass": np.zeros((n, design.p.size)),
         }  # fmt: skip
         outcome = np.where(crash, CRASH, TIMEOUT).astype(np.int8)
-        block = Block(
-            int(rounds.seen.tally.tests.sum()), outcome, np.zeros(n), columns, SamplingPlan("shells", shells=design)
-        )
+        block = Block(int(seen.tally.tests.sum()), outcome, np.zeros(n), columns, SamplingPlan("shells", shells=design))
         sums.add(block)
-        if rounds.enough(block):
+        seen.add(block)
+        if rounds.rule.observe(seen):
             break
     return {row.above_mps: row for row in sums.result(0.9).exceedance}
 

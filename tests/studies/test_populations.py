@@ -12,6 +12,8 @@ from harness.errors import HarnessError
 from harness.estimators.block import Block, SamplingPlan
 from harness.estimators.estimate import Estimate
 from harness.estimators.likelihood import Level
+from harness.estimators.shells import SeenShells
+from harness.estimators.stopping import RoundRule
 from harness.estimators.tally import combined
 from harness.families.cut_in.loading import load_environment
 from harness.pool.shells import acceleration_limit
@@ -169,21 +171,23 @@ def test_counted_tests_say_what_their_records_would(with_references, shadow_runs
     drawn = replace(with_references[shadow_runs], failing=0.3, failing_tests=0.0 if shadow_runs else 0.02)
     design = drawn.design
     campaign, rng = campaign_of(2_000), np.random.default_rng(6)
-    by_row, level, n = ShellRounds(campaign, design, drawn.available(campaign)), Level.two_sided(0.9), 0
+    rounds = ShellRounds(campaign, design, drawn.available(campaign), RoundRule(campaign))
+    by_row, level, n = SeenShells(design), Level.two_sided(0.9), 0
     for seen, _, enough in looks(campaign, drawn, np.random.default_rng(6)):
-        added = by_row.next_round()
-        assert by_row.enough(as_block(drawn, *drawn.tests_of(added, rng), n)) == enough
+        (added,) = rounds.next_round(by_row)
+        by_row.add(as_block(drawn, *drawn.tests_of(added, rng), n))
+        assert rounds.rule.observe(by_row) == enough
         n += int(added.sum())
-        numbers = ((*tally[:5], *(tally.runs or ())) for tally in (seen.tally, by_row.seen.tally))
+        numbers = ((*tally[:5], *(tally.runs or ())) for tally in (seen.tally, by_row.tally))
         for one, other in zip(*numbers, strict=True):
             np.testing.assert_allclose(one, other, rtol=1e-12)
-        limits = by_row.seen.limits(level)
+        limits = by_row.limits(level)
         assert seen.limits(level) == pytest.approx(limits, rel=1e-12)
     assert n == 2_000
-    of_all = combined(design.p, by_row.seen.tally, design.n_independent, level)
+    of_all = combined(design.p, by_row.tally, design.n_independent, level)
     assert limits == of_all  # not of an earlier look
-    assert by_row.seen.tally.totals[2] > 40
-    found, expected = (as_tree(each.result(0.9)) for each in (seen, by_row.seen))
+    assert by_row.tally.totals[2] > 40
+    found, expected = (as_tree(each.result(0.9)) for each in (seen, by_row))
     assert unlike(found, expected, digits=1e-12) == []
 
 
