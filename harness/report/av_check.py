@@ -46,7 +46,8 @@ CAUSES: dict[Cause, str] = {
     "random": "It differs although all else is equal: random numbers of its own (random, numpy.random), or a variable "
     "of its module or class that outlives the object. Draw from episode.random in start; keep state in self.",
     "process": "It differs from process to process: random numbers of its own (random, numpy.random), the number of "
-    "the process, hash() of a text (the order of a set), or an id(). Draw from episode.random in start.",
+    "the process, hash() of a text (the order of a set), an id(), or what earlier tests have left in a variable of its "
+    "module or class. Draw from episode.random in start; keep state in self.",
     "clock": "It depends on the clock ({}): a test may run at any speed. Use time_s of what it sees, or step_s.",
 }
 

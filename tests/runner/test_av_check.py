@@ -123,6 +123,14 @@ class OfItsProcess(Steady):
         return -1e-6 * (os.getpid() % 1000)
 
 
+class Ages(Steady):
+    n_steps = 0
+
+    def step(self, seen):
+        Ages.n_steps += 1
+        return -1e-6 * min(Ages.n_steps, 500)
+
+
 class HashesAText(Steady):
     def step(self, seen):
         return -1e-6 * (hash("BV") % 1000)
@@ -183,6 +191,7 @@ def test_the_built_in_idm_is_fine():
         ),
         pytest.param("OfItsProcess", "It differs from process to process: ", marks=pytest.mark.slow),
         pytest.param("HashesAText", "It differs from process to process: ", marks=pytest.mark.slow),
+        ("Ages", "what earlier tests have left in a variable of its module or class"),
     ],
 )
 def test_a_controller_that_is_not_reproduced_is_found_out(name, why):
