@@ -27,6 +27,8 @@ from harness.vocabulary import ESTIMATORS, StoppedBy
 
 ROOM = 1.25
 """Tests go in steps, and not to all shells alike: beyond those that would just do [measured: 1.15 at most]."""
+MOVES = 1.25
+"""Factor from which it is said by how much assumed numbers move a ratio [assumed]."""
 CARRIES = 0.05
 """Share of a rate from which on there is an upper limit alone, where nothing was seen of it [assumed]."""
 
@@ -48,6 +50,11 @@ class AssumedOfRate:
     def most(self) -> float:
         """The factor by which the rate may be higher; NaN where it is not known."""
         return math.nan if self.times is None else self.times[1]
+
+    @property
+    def moves_ratio(self) -> bool:
+        """Whether the ratio depends notably on how many drivers do not look."""
+        return self.highest is not None and any(not 1.0 / MOVES < times < MOVES for times in self.ratio_times or ())
 
     @property
     def no_lower_limit(self) -> bool:

@@ -19,6 +19,9 @@ from harness.report.rows import Row, decided, end, looking_words, ratio_texts
 from harness.report.words import ShortAnswer
 from harness.strata import LIBRARY_STATEMENT
 
+FAR_APART = 100.0
+"""Times a lower limit from which an upper one is too far to be told with it."""
+
 # -- of several scenarios, from ``families.json``: crashes per hour, beside the competent driver, and each one's part --
 
 
@@ -100,11 +103,15 @@ def family_rows(content: Mapping[str, Any]) -> Iterator[tuple[str, ...]]:
         rate = f"< {number(family['upper_bound'])}"
         if family["n_crashes"]:
             part = "" if family["share"] is None else share(family["share"])
-            rate = f"{number(per_hour)}  {between(family['ci_low'], family['ci_high'], per_hour)}"
+            low, high = family["ci_low"], family["ci_high"]
+            far = high is not None and high >= FAR_APART * low
+            rate = f"{number(per_hour)}  {between(low, high, per_hour)}"
+            if far:  # what is known is a limit
+                rate = f"< {number(high)}  estimate {number(per_hour)}"
             beside = "–" if family["ratio"] is None else f"× {ratio(family['ratio'])}"
             if family["ratio"] is not None and not _side(family):
                 most = "no limit" if family["ratio_high"] is None else number(family["ratio_high"], 2)
-                beside = f"× {number(family['ratio_low'], 2)}–{most}"
+                beside = f"× < {most}" if far else f"× {number(family['ratio_low'], 2)}–{most}"
             if (unseen := _unseen(family)) is not None:
                 rate = f"< {number(unseen[1])}  {number(per_hour)} as fitted"
         impact = family.get("median_impact_mps")
@@ -172,8 +179,7 @@ def between(low: float, high: float | None, rate: float) -> str:
     """The interval of a rate; its ends apart where they are far apart, "no limit" where it is open."""
     if high is None:
         return f"≥ {number(low)}"
-    near = low > 0.0 and high < 100.0 * low
-    return interval(low, high, beside=rate) if near else f"{number(low, 2)} to {number(high, 2)}"
+    return interval(low, high, beside=rate) if high < FAR_APART * low else f"{number(low)} to {number(high)}"
 
 
 def _scope(content: Mapping[str, Any]) -> str:

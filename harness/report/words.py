@@ -22,7 +22,19 @@ from harness.estimators.limits import clopper_pearson
 from harness.estimators.severity import TOUCH_MPS
 from harness.families import family_named
 from harness.loop.cells import FAR_BEHIND_S
-from harness.numbers import WIDEST_RHW, count, duration, interval, leaves, number, plain, share, two_digits_up, words
+from harness.numbers import (
+    WIDEST_RHW,
+    count,
+    duration,
+    interval,
+    leaves,
+    number,
+    plain,
+    ratio,
+    share,
+    two_digits_up,
+    words,
+)
 from harness.report.notes import note_words
 from harness.report.rows import Row, end, held_back, rows_of, too_few, with_traffic
 from harness.sampling.paths import n_left_out
@@ -30,8 +42,6 @@ from harness.strata import ASSUMPTION_FREE
 from harness.vehicles.kinematics import STEP_S
 
 EARLY = "n_crashes_before_event"
-MOVES = 1.25
-"""Factor from which it is said by how much assumed numbers move a ratio."""
 CUT_OFF_SHARE = 0.2
 """Weight, relative to the rate, from which tests that were cut off are warned of, if the interval leaves them out."""
 ENDED = {
@@ -211,19 +221,15 @@ def _ratio_warning(estimates: Estimates) -> Iterator[str]:
     """That the ratio to the reference driver, too, moves with how many drivers do not look behind."""
     assumed, decision = estimates.assumed, estimates.decision
     references = [each for each in estimates.best.details.get("references", ()) if each["crash_rate"] > 0.0][:1]
-    if assumed is None or assumed.ratio_times is None or assumed.highest is None or not references:
+    if assumed is None or not assumed.moves_ratio or not references:
         return
-    low, high = min(assumed.ratio_times), max(assumed.ratio_times)
-    if max(high, 1.0 / max(low, 1e-9)) < MOVES:
-        return
-    turns = False
+    low, high = sorted(references[0]["ratio"] * times for times in assumed.ratio_times or ())
+    turns = ""
     if decision is not None and decision.get("driver") and decision["verdict"] != "undecided":
-        ratio_now, accepted = references[0]["ratio"], decision["verdict"] == "accepted"
-        turns = ratio_now * high >= decision["limit"] if accepted else ratio_now * low <= decision["limit"]
-    ends = f"× {number(low, 2)} to × {number(high, 2)}"
-    yield f"over the assumed range of drivers who do not look the ratio moves, too: {ends}" + (
-        ", which may turn the verdict" * turns
-    )
+        accepted, limit = decision["verdict"] == "accepted", decision["limit"]
+        turns = ", which may turn the verdict" * (high >= limit if accepted else low <= limit)
+    here = "" if assumed.share is None else f", at {plain(100.0 * assumed.share)} %"
+    yield f"the ratio is of drivers who do not look{here}; over their assumed range {ratio(low)} to {ratio(high)}{turns}"
 
 
 def runs_warning(decision: Mapping[str, Any] | None) -> Iterator[str]:
@@ -322,11 +328,11 @@ def remedy_words(changes: Mapping[str, float | None] | None) -> str:
         return ""
     if not changes:
         return "; no pool is large enough for that: raise stop.rhw"
-    phrases = []
-    for key, value in changes.items():
-        way = "lower" if key == "pool.relative_error" else "raise"
-        phrases.append(f"{way} {key}" + ("" if value is None else f" to {value:,.10g}"))
-    return f"; {' and '.join(phrases)}"
+    if None in changes.values():
+        phrases = [f"{'lower' if key == 'pool.relative_error' else 'raise'} {key}" for key in changes]
+        return f"; {' and '.join(phrases)}, with a new --out"
+    settings = " ".join(f"--set {key}={value:.10g}" for key, value in changes.items())
+    return f"; to narrow it: {settings} and a new --out"
 
 
 def elsewhere_words(elsewhere: Elsewhere) -> str:

@@ -159,14 +159,15 @@ def test_an_end_that_says_nothing_is_not_shown(stored_run, verdict, untested):
     ("times", "verdict", "said_of_it"),
     [
         ((0.9, 1.2), "accepted", None),
-        ((3.0, 0.8), None, "× 0.80 to × 3.0"),
-        ((3.0, 0.8), "accepted", "× 0.80 to × 3.0, which may turn the verdict"),
-        ((1.5, 0.8), "accepted", "× 0.80 to × 1.5"),
-        ((0.2, 1.3), "rejected", "× 0.20 to × 1.3"),
+        ((3.0, 0.8), None, "7.20 to 27.0"),
+        ((3.0, 0.8), "accepted", "0.40 to 1.50, which may turn the verdict"),
+        ((1.5, 0.8), "accepted", "0.40 to 0.75"),
+        ((0.2, 1.3), "rejected", "1.80 to 11.7"),
+        ((0.1, 1.3), "rejected", "0.90 to 11.7, which may turn the verdict"),
     ],
 )
 def test_a_ratio_that_moves_with_who_does_not_look_is_warned_of(times, verdict, said_of_it, stored_run):
-    """Of a vehicle with half the reference driver's rate, and a limit of once that."""
+    """Of a vehicle with half or nine times the reference driver's rate, and a limit of once that."""
     run = read_run_folder(stored_run("shells-accepted"))
     details = run.estimates.best.details
     beside = {**details["references"][0], "ratio": 0.5 if verdict == "accepted" else 9.0}
@@ -174,7 +175,7 @@ def test_a_ratio_that_moves_with_who_does_not_look_is_warned_of(times, verdict, 
     decision = verdict and {**run.manifest["decision"], "verdict": verdict, "driver": "r157-cc", "limit": 1.0}
     others = AssumedOfRate("", 0.25, (0.1, 25.0), 0.01, times)
     warnings = said(run, best, decision=decision, assumed=others).warnings
-    found = [text.rpartition("too: ")[2] for text in warnings if "drivers who do not look" in text]
+    found = [text.rpartition("range ")[2] for text in warnings if "drivers who do not look" in text]
     assert found == ([] if said_of_it is None else [said_of_it])
 
 

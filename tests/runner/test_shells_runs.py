@@ -54,7 +54,9 @@ def test_a_pool_that_is_used_up_ends_the_run(tmp_path):
     assert tests[-1] >= 100
     assert result.estimates["n_episodes"] < 1000
     assert set(re.findall(r"pool\.[a-z_]+", json.dumps(answer_in(result.folder)))) == {"pool.events_per_shell"}
-    assert re.search(r"; raise pool\.events_per_shell to \d,?\d+$", answer_in(result.folder)["scope"])
+    assert re.search(
+        r"; to narrow it: --set pool\.events_per_shell=\d+ and a new --out$", answer_in(result.folder)["scope"]
+    )
 
 
 def test_a_vehicle_that_fails_in_most_tests_is_given_up_after_few(tmp_path):
@@ -87,7 +89,7 @@ def test_a_pool_that_is_too_rough_ends_the_run(tmp_path):
     found = fresh.estimates["estimates"]["shells"]
     assert found["rhw"] > found["details"]["rhw_from_pool"] > 0.05
     scope = answer_in(fresh.folder)["scope"]
-    assert re.search(r"; lower pool\.relative_error to 0\.0\d+(?: and [^;]+)?$", scope)
+    assert re.search(r"; to narrow it: --set pool\.relative_error=0\.0\d+ [^;]*and a new --out$", scope)
     assert "pool." not in "".join(map(note_words, found["warnings"]))
 
 
