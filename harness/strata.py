@@ -11,7 +11,7 @@ from functools import cached_property
 from typing import Annotated
 
 import numpy as np
-from pydantic import FiniteFloat, PlainSerializer, PlainValidator, TypeAdapter
+from pydantic import AfterValidator, FiniteFloat, PlainSerializer, PlainValidator, TypeAdapter
 
 from harness.vocabulary import BoolArray, FloatArray, IntArray
 
@@ -161,5 +161,17 @@ class ShellDesign:
         return np.asarray(np.eye(len(self.strata))[list(self.cell_stratum)])
 
 
-STORED_DESIGN = TypeAdapter(ShellDesign)
+def _of_one_size(design: ShellDesign) -> ShellDesign:
+    n, r, strata = len(design.cell_stratum), len(design.references), set(range(len(design.strata)))
+    if not design.cell_p.size == len(design.cell_references) == n or set(design.cell_stratum) != strata:
+        raise ValueError("cells need a stratum, a probability and references each, and strata a cell")
+    if not design.reference_rate.size == design.reference_square.size == r:
+        raise ValueError("references need a rate and a mean square each")
+    if not 0 <= design.n_inside <= len(design.strata):
+        raise ValueError("the boundary lies among the strata")
+    return design
+
+
+StoredDesign = Annotated[ShellDesign, AfterValidator(_of_one_size)]
 """``shells.json`` of a run."""
+STORED_DESIGN = TypeAdapter(StoredDesign)

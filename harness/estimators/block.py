@@ -210,21 +210,22 @@ def joined(blocks: Sequence[Block]) -> Block:
 def block_from_tables(
     campaign: Campaign, episodes: pa.Table, moments: pa.Table | None = None, shells: ShellDesign | None = None
 ) -> Block:
-    """Block of one shard, from tables as a run has written them: files are held against their checksums when read.
+    """Block of one shard; rows that are missing, out of order, or contradict each other are a `RunFolderError`.
 
     ``episodes`` are consecutive rows of that table, in index order, with `EPISODE_COLUMNS`, of ``shells`` also
     `SHELL_COLUMNS`; ``moments``, of the step mixture, are their control steps in order, with `MOMENT_COLUMNS`.
     """
     sampling = campaign.sampling
     alpha = np.array(campaign.mixture_weights, dtype=np.float64)
-    index = _integers(episodes, "episode")
-    outcome = outcome_places(episodes.column("outcome"))
+    index = _consecutive(episodes)
+    outcome = outcome_places(episodes.column("outcome"), "episodes")
     failed = outcome == FAILED
+    n_control_steps = _integers(episodes, "n_control_steps")
     close = pc.less(episodes["end_ttc_s"], DANGER_TTC_S)
     early = pc.less_equal(episodes["took_over_step"], episodes["event_step"])
     columns: dict[str, Column] = {
         "happened": _known(episodes, "event_step"),
-        "n_control_steps": _integers(episodes, "n_control_steps"),
+        "n_control_steps": n_control_steps,
         "n_steps": _integers(episodes, "n_steps"),
         "impact_mps": np.asarray(episodes["impact_speed_mps"].to_numpy(), dtype=np.float64),
         "cut_off": (outcome == TIMEOUT) & pc.fill_null(close, fill_value=False).to_numpy(),
@@ -236,7 +237,7 @@ def block_from_tables(
         columns["log_q"] = _nested(episodes, "log_q", len(alpha))
         columns["martingale"] = _nested(episodes, "martingale", len(campaign.surrogates))
     if moments is not None and sampling.mixes_steps:
-        columns["first_ratios"] = _first_ratios(moments, index)
+        columns["first_ratios"] = _first_ratios(moments, index, np.where(failed, 0, n_control_steps))
     if np.all(_known(episodes, "log_p_event") | failed):
         columns["log_p_event"] = np.asarray(pc.fill_null(episodes.column("log_p_event"), -np.inf).to_numpy())
     if shells is not None:
@@ -253,6 +254,22 @@ def block_from_tables(
     return block.harder_than(above_mps) if above_mps > 0.0 else block
 
 
+def _consecutive(episodes: pa.Table) -> IntArray:
+    """Indices of the episodes, each one more than the last."""
+    index = _integers(episodes, "episode")
+    if not index.size:
+        raise _damaged("episodes", "no rows", "at least one episode per shard")
+    if (gaps := np.diff(index) != 1).any():
+        row = int(np.argmax(gaps))
+        expected = "every episode once, in index order; a failed one is a row too"
+        raise _damaged(f"episodes, row {row + 1}", f"episode {index[row + 1]} after episode {index[row]}", expected)
+    return index
+
+
+def _damaged(where: str, found: str, expected: str) -> RunFolderError:
+    return RunFolderError(where, found, expected, MEND_PART)
+
+
 def _integers(table: pa.Table, name: str) -> IntArray:
     return np.asarray(table.column(name).to_numpy()).astype(np.int64)
 
@@ -261,17 +278,26 @@ def _known(table: pa.Table, name: str) -> BoolArray:
     return np.asarray(pc.is_valid(table.column(name))).astype(np.bool_)
 
 
-def outcome_places(column: pa.ChunkedArray) -> Int8Array:
-    """How each episode ended, as a place in `OUTCOMES`, shape (n,)."""
+def outcome_places(column: pa.ChunkedArray, where: str) -> Int8Array:
+    """How each episode ended, as a place in `OUTCOMES`, shape (n,); a `RunFolderError` where one is unknown."""
     coded = column.cast(pa.string()).combine_chunks().dictionary_encode()
-    places = [OUTCOMES.index(name) for name in coded.dictionary.to_pylist()]
-    return np.asarray(np.array(places, np.int8)[coded.indices.to_numpy()])
+    names = coded.dictionary.to_pylist()
+    if coded.null_count or not {*names} <= {*OUTCOMES}:
+        unknown = next((name for name in names if name not in OUTCOMES), None)
+        found = "an episode without outcome" if unknown is None else f"the outcome {unknown!r}"
+        mend = "The records are from another version of the harness: use that version, or run again."
+        raise RunFolderError(where, found, f"one of {', '.join(OUTCOMES)}", mend)
+    return np.asarray(np.array([OUTCOMES.index(name) for name in names], np.int8)[coded.indices.to_numpy()])
 
 
 def _nested(table: pa.Table, name: str, width: int) -> FloatArray:
     """Read a fixed-size list column as an array of shape (rows, width)."""
     column = table.column(name).combine_chunks()
     values = np.asarray(column.flatten().to_numpy(zero_copy_only=False), dtype=np.float64)
+    if len(values) != table.num_rows * width:
+        expected = f"{width} in each row, by importance function or surrogate of the campaign"
+        mend = "The records belong to another campaign or are damaged. " + MEND_PART
+        raise RunFolderError(f"column {name}", f"{len(values)} numbers in {table.num_rows} rows", expected, mend)
     return values.reshape(table.num_rows, width)
 
 
@@ -279,17 +305,26 @@ def _log_weights(episodes: pa.Table, failed: BoolArray, first: int) -> FloatArra
     """Log weights; that of a failed episode may be unknown and is then 0, the weight of an uncontrolled test."""
     log_weight = np.array(episodes.column("log_weight").to_numpy(), dtype=np.float64)
     log_weight[np.isnan(log_weight) & failed] = 0.0
-    if (wrong := np.isnan(log_weight) | np.isposinf(log_weight)).any():
+    wrong = np.isnan(log_weight) | np.isposinf(log_weight)
+    if wrong.any():
         row = int(np.argmax(wrong))
-        expected = "a number: every weight decides the crash rate"
-        raise RunFolderError(f"episodes, episode {first + row}", f"log_weight {log_weight[row]}", expected, MEND_PART)
+        found, expected = f"log_weight {log_weight[row]}", "a number: every weight decides the crash rate"
+        raise _damaged(f"episodes, episode {first + row}", found, expected)
     return log_weight
 
 
-def _first_ratios(moments: pa.Table, index: IntArray) -> FloatArray:
+def _first_ratios(moments: pa.Table, index: IntArray, n_control_steps: IntArray) -> FloatArray:
     """q_j/q_sampled of the first nine control steps of each episode, shape (n, 9, J); 1 beyond the last one."""
     row = _integers(moments, "episode") - index[0]
+    if len(row) and (row[0] < 0 or row[-1] >= len(index) or np.any(np.diff(row) < 0)):
+        found = f"rows of episodes {row.min() + index[0]} to {row.max() + index[0]}, or out of order"
+        raise _damaged("moments", found, f"episodes {index[0]} to {index[-1]}, in order")
     counts = np.bincount(row, minlength=len(index))
+    needed = np.minimum(n_control_steps, MAX_CONTROL_STEPS)
+    if (counts < needed).any():
+        episode = int(np.argmax(counts < needed))
+        expected = f"{needed[episode]} as the episodes table says"
+        raise _damaged(f"moments, episode {index[episode]}", f"{counts[episode]} control steps", expected)
     rank = np.arange(len(row)) - (np.cumsum(counts) - counts)[row]
     n_surrogates = moments.schema.field("q").type.list_size
     q, q_sampled = _nested(moments, "q", n_surrogates), moments.column("q_sampled").to_numpy()

@@ -250,11 +250,12 @@ def one_pass(
 ) -> PassResult:
     """Feed every block to every estimator that can use it; the ``best``, the headline, is by default the method's own.
 
-    Blocks are contiguous and in index order, from episode 0, and at least one. Too few tests for the headline are a
-    `CampaignError`. ``onset`` is the step before which no event begins, if known.
+    Blocks are contiguous and in index order, from episode 0; a gap, or no episode at all, is a `ValueError`. Too few
+    tests for the headline are a `CampaignError`. ``onset`` is the step before which no event begins, if known.
     """
     blocks = iter(blocks)
-    first = next(blocks)
+    if (first := next(blocks, None)) is None:
+        raise ValueError("an estimate needs at least one episode")
     best = best or first.drawn.sampling.headline
     estimators = {str(each): each for each in (*names, best)}
     own = str(best)
@@ -266,6 +267,8 @@ def one_pass(
     convergence = list[Point]()
     n = 0
     for block in chain((first,), blocks):
+        if block.first_episode != n:
+            raise ValueError(f"expected a block from episode {n} on, got one from {block.first_episode}")
         n += len(block)
         diagnostics.add(block)
         for state in states.values():

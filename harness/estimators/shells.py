@@ -156,7 +156,8 @@ class SeenShells:
 
     def add(self, block: Block) -> None:
         design, crash = block.drawn.shells, block.crash
-        assert design is not None
+        if design is None:
+            raise ValueError("the block has no shells")
         if not self.cells.tests.size:
             self.design, self.cells = design, empty_tally(design.cell_p.size)
         tally, cell, stratum = self.cells, block.cell, block.stratum

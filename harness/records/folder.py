@@ -188,9 +188,13 @@ def read_table(
 
 
 def read_kept(folder: Path, part: Part, table: str, columns: list[str] | None = None) -> pa.Table:
-    """One table of a part; see `read_table`."""
+    """One table of a part, with as many rows as the manifest says; see `read_table`."""
     file = part.files[table]
-    return read_table(folder / file.path, columns, crc32=file.crc32)
+    content = read_table(folder / file.path, columns, crc32=file.crc32)
+    if content.num_rows != file.n_rows:
+        expected = f"{file.n_rows} rows (manifest.json)"
+        raise RunFolderError(str(folder / file.path), f"{content.num_rows} rows", expected, MEND_PART)
+    return content
 
 
 def concatenated(tables: Sequence[pa.Table], folder: Path) -> pa.Table:

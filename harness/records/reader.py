@@ -190,7 +190,8 @@ class ShownTests:
         columns = sorted({"failure", *rows, *motion})
 
         def shown(part: records.Part) -> ShownTests:
-            return cls.of(records.read_kept(folder, part, "episodes", columns), family)
+            episodes = records.read_kept(folder, part, "episodes", columns)
+            return cls.of(episodes.slice(0, max(manifest["n_episodes"] - part.first_episode, 0)), family)
 
         return cls.joined(list(made_ahead(shown, manifest["parts"], N_READERS)), folder)
 

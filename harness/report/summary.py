@@ -110,6 +110,9 @@ def _read_estimates(folder: Path, campaign_hash: str) -> Estimates:
         expected = f"those of campaign {campaign_hash} (manifest.json)"
         found = f"estimates of campaign {estimates.campaign_hash}"
         raise RunFolderError(str(path), found, expected, again)
+    if not isinstance(estimates.estimates.get(estimates.headline), Estimate):
+        found = f"headline {estimates.headline!r}, of which there is no estimate"
+        raise RunFolderError(str(path), found, f"one of {sorted(estimates.estimates)}", again)
     return estimates
 
 
@@ -170,13 +173,13 @@ def floats(column: pa.Array) -> FloatArray:
 
 
 def summarise(run: RunFolder) -> RunSummary:
-    """Count and weigh the tests of a run."""
-    tests = run.tests
-    places = outcome_places(pa.chunked_array([[*tests.outcomes]]))
+    """Count and weigh the tests of a run; a `RunFolderError` where one has an unknown outcome."""
+    tests, where = run.tests, str(run.path / "episodes")
+    places = outcome_places(pa.chunked_array([[*tests.outcomes]]), where)
     count: FloatArray = np.bincount(places, [*tests.outcomes.values()], len(OUTCOMES)).astype(np.float64)
     names = [name for name in tests.rows.column_names if name != "outcome"]
     rows = {name: floats(tests.rows[name]) for name in names}
-    outcome = outcome_places(tests.rows["outcome"]).astype(np.int64)
+    outcome = outcome_places(tests.rows["outcome"], where).astype(np.int64)
     left_out: FloatArray = count - np.bincount(outcome, minlength=len(OUTCOMES))  # those weigh 1 each
     if (least_mps := run.campaign.crash.counts_above_mps) > 0.0:  # no harder is none here, as in the estimates
         outcome[(outcome == CRASH) & (rows["impact_speed_mps"] <= least_mps)] = TIMEOUT

@@ -50,6 +50,8 @@ from harness.shown import ShownInPython
 from harness.vocabulary import COMPARISON, ESTIMATORS, FAMILIES
 from harness.worlds import build_world
 
+_FINISH = "Run `harness run` with --resume, which makes missing tests."
+
 
 class StoredEstimates(ShownInPython, dict[str, Any]):
     """Content of ``estimates.json`` or ``families.json``; printed, the short answer, or a line per estimator."""
@@ -113,14 +115,14 @@ def estimate_run(
 
 
 def stored_blocks(folder: Path, *, moments: bool) -> Iterator[Block]:
-    """Blocks of all tests, in index order from 0.
+    """Blocks of the tests that are reported, in index order from 0; a gap or too few of them is an error.
 
     With ``moments`` ratios of control steps are read, which `scv` needs, where there are any on record. Raises
     `HarnessError`: if the folder is not a run, or its records are damaged or incomplete.
     """
     manifest = read_manifest(folder)
     campaign = read_campaign(folder, manifest)
-    if not manifest["parts"]:
+    if not (n_counted := int(manifest["n_episodes"])):
         raise no_episodes(folder)
     source = source_of(campaign)
     design = stored_design(folder) if campaign.sampling.strata else None
@@ -134,7 +136,17 @@ def stored_blocks(folder: Path, *, moments: bool) -> Iterator[Block]:
         steps = read_kept(folder, part, "moments", ratios) if ratios and "moments" in part.files else no_steps
         return block_from_tables(campaign, read_kept(folder, part, "episodes", columns), steps, design)
 
-    yield from made_ahead(read, manifest["parts"], N_READERS)
+    n = 0
+    for block in made_ahead(read, manifest["parts"], N_READERS):
+        if block.first_episode != n:
+            raise RunFolderError(str(folder), f"a part that begins at test {block.first_episode}", f"test {n}", _FINISH)
+        counted = block.take(slice(0, n_counted - n))
+        n += len(counted)
+        if len(counted):
+            yield counted
+        if n == n_counted:
+            return
+    raise RunFolderError(str(folder), f"{n} tests on record", f"{n_counted} (manifest.json)", _FINISH)
 
 
 _TRUST = "Look at stored motion alone (--stored), which runs no code; or read that code, and then add --trust."

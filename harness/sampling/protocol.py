@@ -101,12 +101,12 @@ class Source:
         """Names of the files that building leaves in the cache: with a copy of them another machine builds nothing."""
         return []
 
-    def begin_after(self, runs: Recorded) -> None:
+    def begin_after(self, runs: Recorded) -> None:  # noqa: ARG002 - there are none
         """Draw tests by what the vehicle did in its baseline runs, along `baseline_paths`.
 
         Raises `HarnessError`: nothing on these paths can be tested.
         """
-        raise NotImplementedError
+        raise ValueError("this campaign has no baseline runs")
 
     def paths(self, first_episode: int, n_episodes: int) -> Paths:
         """Paths of consecutive episodes, (n_episodes,)."""

@@ -39,7 +39,7 @@ from harness.progress import Progress
 from harness.records.folder import SHELLS, read_as
 from harness.resolved import Resolved
 from harness.sampling.protocol import ShardRequest, Source
-from harness.strata import ASSUMPTION_FREE, LIBRARY_STATEMENT, ShellDesign
+from harness.strata import ASSUMPTION_FREE, LIBRARY_STATEMENT, ShellDesign, StoredDesign
 from harness.vocabulary import FloatArray, IntArray
 
 GROWTH = 1.1
@@ -78,7 +78,7 @@ def pool_of(resolved: Resolved, progress: Progress) -> Pool:
 def stored_design(folder: Path) -> ShellDesign:
     """Strata of a stored run; a `RunFolderError` where they are missing, damaged, or of a too early version."""
     mend = "Run `harness run` with --resume, which makes what is missing."
-    return read_as(ShellDesign, folder / SHELLS, mend=mend)
+    return read_as(StoredDesign, folder / SHELLS, mend=mend)
 
 
 class Shells(Source):
@@ -106,7 +106,8 @@ class Shells(Source):
         return [baseline_paths_name(resolved) if acts else pool_name(campaign_pool_key(resolved))]
 
     def begin_after(self, runs: Recorded) -> None:
-        assert self.baseline_paths is not None
+        if self.baseline_paths is None:
+            raise ValueError("this campaign has no baseline runs")
         self._draw_from(vehicle_pool(self.resolved, self.baseline_paths, runs))
 
     def run(self, loop: EpisodeLoop, request: ShardRequest) -> Shard:

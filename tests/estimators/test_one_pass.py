@@ -179,6 +179,10 @@ def tables(stored_run):
     return stored_table(stored_run(NAME), "episodes"), stored_table(stored_run(NAME), "moments")
 
 
+def without(table: pa.Table, row: int) -> pa.Table:
+    return pa.concat_tables([table.slice(0, row), table.slice(row + 1)])
+
+
 def of_others(moments: pa.Table, episode: int) -> pa.Table:
     return moments.filter(pa.array(moments["episode"].to_numpy() != episode))
 
@@ -215,10 +219,18 @@ def test_ratios_are_those_of_the_first_nine_control_steps(tables):
     np.testing.assert_allclose(found.first_ratios, expected, rtol=1e-15)
 
 
-def test_a_weight_that_is_no_number_is_refused(tables):
-    episodes, moments = tables
-    with pytest.raises(RunFolderError, match="5: found log_weight nan"):
-        read(with_value(episodes, "log_weight", 5, np.nan), moments)
+@pytest.mark.parametrize(
+    ("damage", "text"),
+    [
+        (lambda episodes, moments: (without(episodes, 10), moments), "row 10: found episode 11 after episode 9"),
+        (lambda episodes, moments: (with_value(episodes, "log_weight", 5, np.nan), moments), "5: found log_weight nan"),
+        (lambda episodes, moments: (episodes, of_others(moments, 100)), "moments, episode 100: found"),
+        (lambda episodes, moments: (episodes, moments.take(pa.array(range(len(moments))[::-1]))), "in order"),
+    ],
+)
+def test_damaged_tables_name_the_place(damage, text, tables):
+    with pytest.raises(RunFolderError, match=text):
+        read(*damage(*tables))
 
 
 def test_a_failed_episode_may_lack_its_weight_and_its_moments(tables):

@@ -34,6 +34,7 @@ from tests.in_process import controllers_here, one_process, run_here, run_with_w
 from tests.stored_runs import (
     ROOT,
     copy_of,
+    edit,
     estimates,
     golden,
     manifest,
@@ -58,10 +59,11 @@ def test_estimating_again_gives_the_same_content_and_another_confidence_the_same
     assert wider["estimates"][headline]["ci_high"] > stored["estimates"][headline]["ci_high"]
 
 
-def test_what_is_asked_and_the_headline_are_estimated(tmp_path):
+def test_of_the_prefix_that_counts_what_is_asked_and_the_headline_are_estimated(tmp_path):
     folder = run_here(golden("step-recursive-twin", "records.moments=none"), tmp_path / "run").folder
+    edit(folder, n_episodes=200)
     content, asked = estimate_run(folder), estimate_run(folder, estimators=["scv"])
-    assert content["n_episodes"] == content["convergence"][-1]["n"] == manifest(folder)["n_episodes"]
+    assert content["n_episodes"] == content["convergence"][-1]["n"] == 200
     assert asked["estimates"] == {name: content["estimates"][name] for name in ("nade", "scv")}
     assert content["estimates"]["scv"]["crash_rate"] is None
     assert content["estimates"]["scv"]["why"]["key"] == "needs_moments"
