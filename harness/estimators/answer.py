@@ -19,7 +19,7 @@ from harness.estimators.one_pass import AnyEstimator, headline_of, one_pass
 from harness.estimators.severity import Severity
 from harness.estimators.shells import SeenShells
 from harness.estimators.stopping import Rule
-from harness.estimators.traffic import TrafficError
+from harness.estimators.traffic import LEAST_SHARE, TrafficError
 from harness.families import family_named
 from harness.numbers import two_digits_up
 from harness.strata import Assumed, weight_of_a_test
@@ -153,7 +153,10 @@ def estimate_blocks(
 
 
 def _of_rate(assumed: Assumed, best: Estimate) -> AssumedOfRate:
-    """The factors by which the rate moves over what is assumed; without a crash, those of its upper limit."""
+    """The factors by which the rate moves over what is assumed; without a crash, those of its upper limit.
+
+    Where a vehicle crashes on few events of the shells that it crashes in, these may all be of drivers who do not look.
+    """
     times, of_ratio, shells = None, None, best.details.get("shells")
     if assumed.times is not None and shells:
         p, n, share = np.array([(shell["p"], shell["n_episodes"], shell["crash_share"]) for shell in shells]).T
@@ -161,7 +164,9 @@ def _of_rate(assumed: Assumed, best: Estimate) -> AssumedOfRate:
         # Without a crash the upper limit comes from one stratum: that in which a crash would weigh most.
         rates = masses @ share if best.n_crashes else weight_of_a_test(masses, n.astype(np.int64)).max(1)
         times = float(rates[1] / rates[0]), float(rates[2] / rates[0])
-        if best.n_crashes and assumed.reference_times is not None:
+        if best.n_crashes and p @ share**2 < LEAST_SHARE * (p @ share):
+            times = times[0], max(times[1], (assumed.highest or 0.0) / (assumed.share or 1.0))
+        elif best.n_crashes and assumed.reference_times is not None:
             of_ratio = times[0] / assumed.reference_times[0], times[1] / assumed.reference_times[1]
     return AssumedOfRate(assumed.where, assumed.highest, times, assumed.share, of_ratio)
 

@@ -212,11 +212,8 @@ def _open_question(shown: ShownShells, names: tuple[str, ...], half_widths: list
     name, most = names[half_widths.index(widest)], share(shown.share_of_uncertainty(widest))
     if name == POOL:
         return f"Most of what is not known is the pool’s own error ({most}): only a pool of more paths would narrow it."
-    used_up = name in {
-        shell.shell
-        for shell, kept in zip(shown.shells, shown.design.available, strict=False)
-        if kept <= shell.n_episodes
-    }
+    kept = zip(shown.shells, shown.design.available, strict=False)
+    used_up = name in [shell.shell for shell, available in kept if shell.n_episodes >= available]
     remedy = "the pool has no further event of it" if used_up else "further tests help most there"
     return f"Most of what is not known lies in {name} ({most}): {remedy}."
 

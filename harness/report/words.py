@@ -14,6 +14,7 @@ from typing import Any
 
 from pydantic import BaseModel
 
+from harness import numbers
 from harness.campaign.campaign import Campaign
 from harness.campaign.vehicle import AutomatedVehicle
 from harness.estimators.answer import MANY, STORED_ESTIMATES, Elsewhere, Estimates, before_event
@@ -22,19 +23,7 @@ from harness.estimators.limits import clopper_pearson
 from harness.estimators.severity import TOUCH_MPS
 from harness.families import family_named
 from harness.loop.cells import FAR_BEHIND_S
-from harness.numbers import (
-    WIDEST_RHW,
-    count,
-    duration,
-    interval,
-    leaves,
-    number,
-    plain,
-    ratio,
-    share,
-    two_digits_up,
-    words,
-)
+from harness.numbers import WIDEST_RHW, count, duration, interval, leaves, number, plain, share, two_digits_up, words
 from harness.report.notes import note_words
 from harness.report.rows import Row, end, held_back, rows_of, too_few, with_traffic
 from harness.sampling.paths import n_left_out
@@ -229,7 +218,8 @@ def _ratio_warning(estimates: Estimates) -> Iterator[str]:
         accepted, limit = decision["verdict"] == "accepted", decision["limit"]
         turns = ", which may turn the verdict" * (high >= limit if accepted else low <= limit)
     here = "" if assumed.share is None else f", at {plain(100.0 * assumed.share)} %"
-    yield f"the ratio is of drivers who do not look{here}; over their assumed range {ratio(low)} to {ratio(high)}{turns}"
+    ends = " to ".join(map(numbers.ratio, (low, high)))
+    yield f"the ratio rests on who does not look behind{here}; over the assumed range it is {ends}{turns}"
 
 
 def runs_warning(decision: Mapping[str, Any] | None) -> Iterator[str]:

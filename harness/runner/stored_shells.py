@@ -23,6 +23,7 @@ from harness.errors import CampaignError, RunFolderError
 from harness.estimators.block import Block
 from harness.estimators.likelihood import Level, likelihood_limit
 from harness.estimators.shells import SeenShells
+from harness.estimators.traffic import LEAST_SHARE
 from harness.numbers import share
 from harness.pool.build import campaign_pool
 from harness.pool.moved import FewPaths, OnPaths, environment_with, ranges, ratio_of
@@ -42,10 +43,6 @@ SAME_POOL = 0.05
 """How far a pool that another version has built may differ [assumed]."""
 MOST_OFF = 0.05
 """How far the rate of a reference driver may come out wrong [assumed; docs/environment.md says what it misses]."""
-LEAST_SHARE = 0.5
-"""Mean share of a shell's events on which the vehicle crashes, from which on shares are taken to stay the same. Where
-events take time, rates of drivers with 0.58 or more came out wrong by at most 6 %, with 0.33 by 16 %, with 0.1 by 28 %,
-with 0.02 by more than a factor of 3 (`python -m benchmarks.other_traffic`)."""
 FAR_OFF = 0.5
 """As `MOST_OFF`, in traffic close by, where each rate is taken to be as wrong as the drivers' [assumed]."""
 OPTION = "--environment"

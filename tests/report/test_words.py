@@ -175,7 +175,7 @@ def test_a_ratio_that_moves_with_who_does_not_look_is_warned_of(times, verdict, 
     decision = verdict and {**run.manifest["decision"], "verdict": verdict, "driver": "r157-cc", "limit": 1.0}
     others = AssumedOfRate("", 0.25, (0.1, 25.0), 0.01, times)
     warnings = said(run, best, decision=decision, assumed=others).warnings
-    found = [text.rpartition("range ")[2] for text in warnings if "drivers who do not look" in text]
+    found = [text.rpartition("it is ")[2] for text in warnings if "rests on who does not look" in text]
     assert found == ([] if said_of_it is None else [said_of_it])
 
 

@@ -14,7 +14,7 @@ import pytest
 from harness.campaign.sections import EnvironmentSettings
 from harness.cli import main
 from harness.errors import CampaignError, HarnessError
-from harness.estimators.answer import estimate_blocks
+from harness.estimators.answer import _of_rate, estimate_blocks
 from harness.estimators.traffic import ONE_LAW, uncertain
 from harness.families.cut_in.loading import load_parameters
 from harness.families.cut_in.parameters import SHIPPED_FOLDER
@@ -22,11 +22,12 @@ from harness.pool import moved
 from harness.pool.moved import OnPaths, assumed
 from harness.progress import Progress
 from harness.report.rows import bar_note
+from harness.report.summary import read_run_folder
 from harness.resolved import resolve
 from harness.runner import other_traffic, stored_shells
 from harness.runner.other_traffic import Move, bar_of, bar_of_readings, estimate_in_other_traffic, moves, sensitivity
 from harness.runner.stored_shells import Nearby, StoredShells
-from harness.strata import Reference
+from harness.strata import Assumed, Reference
 from tests.golden.campaigns import LATERAL_FILE
 from tests.stored_runs import answer, copy_of, estimates, golden, manifest
 from tests.traffic.tables import TEXT, fitted
@@ -154,6 +155,18 @@ def test_who_may_look_less_is_a_line_of_its_own(folder, tmp_path):
     (bar,) = (bar for bar in moved["bars"] if bar["what"] == "cut_in.ignore_share")
     assert content["assumed"]["ratio_times"] == pytest.approx(bar["ratio"], rel=1e-9)
     assert assumed(tested.here, tested.pool, tested.design, Progress()) is None
+
+
+@pytest.mark.parametrize(("crash_share", "most", "of_ratio"), [(0.9, 2.3, (0.1, 2.3)), (0.02, 25.0, None)])
+def test_crashes_on_few_events_of_a_shell_may_all_be_of_drivers_who_do_not_look(
+    crash_share, most, of_ratio, stored_run
+):
+    best = read_run_folder(stored_run("shells-twin")).estimates.best
+    shells = [{**shell, "crash_share": crash_share} for shell in best.details["shells"]]
+    times = (0.1,) * len(shells), (2.3,) * len(shells)
+    found = _of_rate(Assumed("", 0.25, times, 0.01, (1.0, 1.0)), replace(best, details={"shells": shells}))
+    assert found.times == pytest.approx((0.1, most))
+    assert found.ratio_times == (of_ratio and pytest.approx(of_ratio))
 
 
 def test_replicates_that_are_gone_are_refused(stored_run, tmp_path):
