@@ -179,6 +179,10 @@ def print_either(content: Any, lines: Iterable[object], *, as_json: bool) -> Non
         say(*lines)
 
 
+MOST_NAME = 40
+"""Characters up to which names in a table's first column are not broken."""
+
+
 def print_table(title: str, rows: Sequence[Mapping[str, Any]]) -> None:
     """Print mappings of the same keys as a table; numbers to four digits and flush right, and nothing is cut off."""
     from rich.console import Console
@@ -187,7 +191,8 @@ def print_table(title: str, rows: Sequence[Mapping[str, Any]]) -> None:
     table = Table(title=title)
     for heading, cell in rows[0].items():
         justify: Literal["left", "right"] = "left" if isinstance(cell, str) else "right"
-        table.add_column(heading.replace("_", " "), justify=justify, overflow="fold", no_wrap=not table.columns)
+        table.add_column(heading.replace("_", " "), justify=justify, overflow="fold")
+    table.columns[0].no_wrap = max(len(words(next(iter(row.values())))) for row in rows) <= MOST_NAME
     for row in rows:
         table.add_row(*(printable(words(cell, 4)) for cell in row.values()))
     console = Console()
