@@ -282,7 +282,9 @@ def test_what_resuming_does_not_find_is_noted(tmp_path, monkeypatch, capsys):
     assert "nothing to resume in" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize(("asked", "at_most"), [("r157-cc", 1.0), ("0.5*r157-cc", 0.5), ("0.5r157-cc", 0.5)])
+@pytest.mark.parametrize(
+    ("asked", "at_most"), [("r157-cc", 1.0), ("0.5*r157-cc", 0.5), ("0.5r157-cc", 0.5), ("r157-cc*0.5", 0.5)]
+)
 def test_a_limit_by_hand_replaces_that_of_the_campaign(asked, at_most, tmp_path, monkeypatch):
     run = Mock(side_effect=ZeroDivisionError)
     monkeypatch.setattr("harness.run", run)

@@ -153,6 +153,8 @@ def accepting(limit: str) -> list[str]:
         keys, value = ("crash_rate_below", "times_reference"), f"{float(limit)!r}"
     except ValueError:
         times, star, driver = limit.rpartition("*")
+        if re.fullmatch(r"[\s\d.]+", driver):  # r157-cc*0.5
+            times, driver = driver, times
         if not star:  # 0.5r157-cc can mean nothing else
             times, driver = re.findall(r"^([\d.]*)(.*)$", limit)[0]
         keys = ("times_reference", "crash_rate_below")

@@ -100,7 +100,7 @@ def vehicle_words(av: AutomatedVehicle, *, script: float | None = None) -> tuple
         name = f"SUMO’s {chosen.pop('carFollowModel', 'Krauss')}"
     elif script:  # SUMO would know its vehicle's type, whose numbers hold until the script sets others
         accel, decel = plain(av.traci_style.accel_mps2), plain(av.traci_style.decel_mps2)
-        chosen["type"] = f"accel {accel}, decel {decel}, minGap 0 at first"
+        chosen["type"] = f"accel {accel}, decel {decel}, minGap 0"
         chosen |= {} if script == STEP_S else {"step": f"{plain(script)} s"}
     elif av.traci is not None:
         name = f"TraCI client {Path(av.traci.command.split()[0]).name}"
@@ -285,6 +285,8 @@ def _scope(campaign: Campaign, manifest: Mapping[str, Any], estimates: Estimates
     elif stopped_by == "episodes":
         decision = estimates.decision
         ended = "all tests done" if decision is None else ended + go_on(best.n_episodes, best.n_crashes, decision)
+    elif stopped_by == "pool" and campaign.accept is not None:
+        ended += remedy_words(manifest.get("remedy") or {"pool.events_per_shell": None})
     elif stopped_by in ("rhw", "below_reference") and campaign.testing.shells.statement != ASSUMPTION_FREE:
         ended += f", given the {campaign.testing.shells.statement}"
     test = family_named(campaign.scenario).words.test
