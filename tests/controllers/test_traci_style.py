@@ -164,8 +164,8 @@ def test_what_is_not_the_avs_or_not_possible_is_refused(traci, reason, name, arg
 
 
 def test_a_misspelt_command_is_not_taken_for_one_of_tracis_that_is_refused(traci):
-    with pytest.raises(AttributeError, match="has no setAccelration here"):
-        traci.vehicle.setAccelration("AV", 1.0, 1.0)
+    with pytest.raises(AttributeError, match="has no setAccelerations here"):
+        traci.vehicle.setAccelerations("AV", 1.0, 1.0)
 
 
 def start(episode=0):
