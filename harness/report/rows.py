@@ -184,6 +184,22 @@ def ratio_texts(reference: Mapping[str, Any], *, wide: bool, from_below: bool, s
     return f"{ratio(value)} ({side})", f"≥ {ratio(low)}" if from_below else f"{ratio(low)} to {most}"
 
 
+def ratio_warning(estimates: Estimates) -> Iterator[str]:
+    """That the ratio to the reference driver, too, moves with how many drivers do not look behind."""
+    assumed, decision = estimates.assumed, estimates.decision
+    references = [each for each in estimates.best.details.get("references", ()) if each["crash_rate"] > 0.0][:1]
+    if assumed is None or not assumed.moves_ratio or not references:
+        return
+    low, high = sorted(references[0]["ratio"] * times for times in assumed.ratio_times or ())
+    turns = ""
+    if decision is not None and decision.get("driver") and decision["verdict"] != "undecided":
+        accepted, limit = decision["verdict"] == "accepted", decision["limit"]
+        turns = ", which may turn the verdict" * (high >= limit if accepted else low <= limit)
+    here = "" if assumed.share is None else f", at {plain(100.0 * assumed.share)} %"
+    ends = " to ".join(map(ratio, (low, high)))
+    yield f"the ratio rests on who does not look behind{here}; over the assumed range it is {ends}{turns}"
+
+
 def within(estimate: Mapping[str, Any]) -> Row:
     """What holds if the vehicle crashes only within the library's boundary, and whether it does."""
     n, outside = estimate["n_crashes_outside"], count(estimate["n_episodes_outside"])

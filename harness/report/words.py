@@ -14,7 +14,6 @@ from typing import Any
 
 from pydantic import BaseModel
 
-from harness import numbers
 from harness.campaign.campaign import Campaign
 from harness.campaign.vehicle import AutomatedVehicle
 from harness.estimators.answer import MANY, STORED_ESTIMATES, Elsewhere, Estimates, before_event
@@ -25,7 +24,7 @@ from harness.families import family_named
 from harness.loop.cells import FAR_BEHIND_S
 from harness.numbers import WIDEST_RHW, count, duration, interval, leaves, number, plain, share, two_digits_up, words
 from harness.report.notes import note_words
-from harness.report.rows import Row, end, held_back, rows_of, too_few, with_traffic
+from harness.report.rows import Row, end, held_back, ratio_warning, rows_of, too_few, with_traffic
 from harness.sampling.paths import n_left_out
 from harness.strata import ASSUMPTION_FREE
 from harness.vehicles.kinematics import STEP_S
@@ -196,7 +195,7 @@ def _warnings(campaign: Campaign, manifest: Mapping[str, Any], estimates: Estima
     if assumed is not None and assumed.where and assumed.times is None:
         yield unseen_words(assumed.where)
     yield from runs_warning(estimates.decision)
-    yield from _ratio_warning(estimates)
+    yield from ratio_warning(estimates)
     on_rate = estimates.decision is not None and not estimates.decision.get("driver")
     if on_rate and assumed is not None and assumed.no_lower_limit:
         yield f"no lane change was seen at {assumed.where}: a limit on the rate rests on that; use --accept r157-cc"
@@ -204,22 +203,6 @@ def _warnings(campaign: Campaign, manifest: Mapping[str, Any], estimates: Estima
         yield f"lane_change_level is {plain(level)}: compare only with rates at the same level"
     if traffic is not None:
         yield from too_few(traffic.n_replicates, traffic.confidence)
-
-
-def _ratio_warning(estimates: Estimates) -> Iterator[str]:
-    """That the ratio to the reference driver, too, moves with how many drivers do not look behind."""
-    assumed, decision = estimates.assumed, estimates.decision
-    references = [each for each in estimates.best.details.get("references", ()) if each["crash_rate"] > 0.0][:1]
-    if assumed is None or not assumed.moves_ratio or not references:
-        return
-    low, high = sorted(references[0]["ratio"] * times for times in assumed.ratio_times or ())
-    turns = ""
-    if decision is not None and decision.get("driver") and decision["verdict"] != "undecided":
-        accepted, limit = decision["verdict"] == "accepted", decision["limit"]
-        turns = ", which may turn the verdict" * (high >= limit if accepted else low <= limit)
-    here = "" if assumed.share is None else f", at {plain(100.0 * assumed.share)} %"
-    ends = " to ".join(map(numbers.ratio, (low, high)))
-    yield f"the ratio rests on who does not look behind{here}; over the assumed range it is {ends}{turns}"
 
 
 def runs_warning(decision: Mapping[str, Any] | None) -> Iterator[str]:
