@@ -76,7 +76,7 @@ def run_campaign(
     >>> result = harness.run(idm, "runs/idm")
     >>> print(result)  # doctest: +ELLIPSIS
     idm · 1,000 tests in SUMO’s twin, cut-in · ...
-      crash rate    1.95 × 10⁻⁷ per test  (0.73 to 7.14) × 10⁻⁷  0.586 per million km
+      crash rate    1.95 × 10⁻⁷ per test  (0.73 to 7.14) × 10⁻⁷  0.586 per million km overtaking
       ...
     >>> result.stopped_by, result.exit_code
     ('episodes', 0)

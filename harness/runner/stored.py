@@ -180,7 +180,7 @@ def replay_episode(
 
     >>> import harness
     >>> harness.replay("runs/idm", 17)
-    test 17: timeout
+    test 17: time up, no crash
       BV enters the lane 3.1 to 3.2 s: 26.2 m ahead and 10.1 m/s slower
       AV brakes          3.2 s, 0.1 s after BV entered the lane: at up to 4.0 m/s²
       AV                 avoids it, 12.1 m at the closest
