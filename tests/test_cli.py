@@ -3,6 +3,7 @@
 import errno
 import json
 import os
+import shutil
 import signal
 import sys
 from contextlib import suppress
@@ -292,6 +293,19 @@ def test_a_limit_by_hand_replaces_that_of_the_campaign(asked, at_most, tmp_path,
     with pytest.raises(ZeroDivisionError):
         main(["run", "idm", "--out", str(tmp_path / "run"), "--set", own, "--accept", asked])
     assert run.call_args.args[0].accept.times_reference.at_most == at_most
+
+
+@pytest.mark.parametrize("beside", ["manifest.json", "families.json", None])
+def test_a_runs_own_campaign_resumes_that_run(beside, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("harness.run", run := Mock(side_effect=ZeroDivisionError))
+    (folder := tmp_path / "of_a_run").mkdir()
+    shutil.copy(SMOKE, folder / "campaign.yaml")
+    if beside is not None:
+        (folder / beside).write_text("{}")
+    with pytest.raises(ZeroDivisionError):
+        main(["run", str(folder / "campaign.yaml"), "--resume"])
+    assert run.call_args.args[1] == (Path("runs/smoke") if beside is None else folder)
 
 
 def test_estimate_writes_only_when_asked(folder, capsys):

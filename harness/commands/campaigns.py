@@ -126,8 +126,9 @@ def run(
         campaign = harness.load_campaign(campaign_file, settings, av=av)
     if junit is not None and campaign.accept is None:
         say("note: without a limit (--accept) the JUnit file says only whether the run reached its end", err=True)
-    if folder is None and resume and (campaign_file.parent / "manifest.json").is_file():  # a run's own campaign.yaml
-        folder = campaign_file.parent
+    ran = campaign_file.name == "campaign.yaml"  # which a run has written into its folder
+    if resume and ran and any((campaign_file.parent / name).is_file() for name in ("manifest.json", FAMILIES)):
+        folder = folder or campaign_file.parent
     folder = folder or options.run_folder(campaign, resume=resume)
     if resume and not holds_tests(folder):
         say(f"note: nothing to resume in {folder}: starts anew", err=True)

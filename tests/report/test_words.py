@@ -135,6 +135,13 @@ def test_what_a_missed_precision_takes_is_told_once(stored_run):
     assert re.findall(r"stop\.episodes=\d+", told) == ["stop.episodes=900"]
 
 
+def test_a_gate_whose_pool_is_used_up_says_what_to_raise(stored_run):
+    run = read_run_folder(stored_run("shells-accepted"))
+    decision = {**run.manifest["decision"], "verdict": "undecided"}
+    answer = said(run, stopped_by="pool", decision=decision)
+    assert answer.scope.endswith("; raise pool.events_per_shell, with a new --out")
+
+
 @pytest.mark.parametrize(("verdict", "untested"), [("rejected", False), ("rejected", True), ("accepted", True)])
 def test_an_end_that_says_nothing_is_not_shown(stored_run, verdict, untested):
     """Where a limit is rejected, or the upper end is what has not been tested: the lower end alone says something."""
