@@ -68,6 +68,11 @@ class Assumed:
     share: float | None = None
     reference_times: tuple[float, float] | None = None
 
+    @property
+    def at_most(self) -> float:
+        """Factor of the rate of a vehicle that crashes on events of drivers who do not look, and on no others."""
+        return (self.highest or 0.0) / (self.share or 1.0)
+
 
 @dataclass(frozen=True, eq=False)
 class ShellDesign:

@@ -19,7 +19,7 @@ from harness.estimators.one_pass import AnyEstimator, headline_of, one_pass
 from harness.estimators.severity import Severity
 from harness.estimators.shells import SeenShells
 from harness.estimators.stopping import Rule
-from harness.estimators.traffic import LEAST_SHARE, TrafficError
+from harness.estimators.traffic import LEAST_SHARE, TrafficError, mean_share
 from harness.families import family_named
 from harness.numbers import two_digits_up
 from harness.strata import Assumed, weight_of_a_test
@@ -164,8 +164,8 @@ def _of_rate(assumed: Assumed, best: Estimate) -> AssumedOfRate:
         # Without a crash the upper limit comes from one stratum: that in which a crash would weigh most.
         rates = masses @ share if best.n_crashes else weight_of_a_test(masses, n.astype(np.int64)).max(1)
         times = float(rates[1] / rates[0]), float(rates[2] / rates[0])
-        if best.n_crashes and p @ share**2 < LEAST_SHARE * (p @ share):
-            times = times[0], max(times[1], (assumed.highest or 0.0) / (assumed.share or 1.0))
+        if mean_share(p, share) < LEAST_SHARE:
+            times = times[0], max(times[1], assumed.at_most)
         elif best.n_crashes and assumed.reference_times is not None:
             of_ratio = times[0] / assumed.reference_times[0], times[1] / assumed.reference_times[1]
     return AssumedOfRate(assumed.where, assumed.highest, times, assumed.share, of_ratio)

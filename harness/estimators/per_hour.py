@@ -19,6 +19,7 @@ from harness.estimators.beside import limits_over, path_errors
 from harness.estimators.likelihood import Counts, Level, likelihood_limit
 from harness.estimators.shells import SeenShells
 from harness.estimators.tally import FEWEST_PATHS, RateLimits, Tally, paths_that_count, pool_variance
+from harness.estimators.traffic import LEAST_SHARE, mean_share
 from harness.families.protocol import Exposure
 from harness.strata import ASSUMPTION_FREE, Assumed
 from harness.vocabulary import FloatArray
@@ -78,11 +79,14 @@ class FamilyTests(NamedTuple):
         rates = [(self.rate, self.reference_rate)]
         if self.assumed is not None and self.assumed.highest is not None and self.assumed.times is not None:
             cells = design.cell_p * design.crashes_too(self.reference) if design.references else np.zeros(0)
-            for times in np.array(self.assumed.times) / self.events_moved[:, None]:
+            least = np.zeros(2)
+            if mean_share(self.p, self.tally.share) < LEAST_SHARE:  # all of these may be of drivers who do not look
+                least[1] = self.assumed.at_most * self.rate / self.events_moved[1]
+            for times, at_least in zip(np.array(self.assumed.times) / self.events_moved[:, None], least, strict=True):
                 theirs = self.reference_rate
                 if cells.any():
                     theirs *= float(cells @ times[np.array(design.cell_stratum)] / cells.sum())
-                rates.append((float(self.p * times @ self.tally.share), theirs))
+                rates.append((max(float(self.p * times @ self.tally.share), float(at_least)), theirs))
         ends = [1.0] if exposure.counted else [exposure.low / exposure.per_hour, exposure.high / exposure.per_hour]
         return [(end * mine, end * theirs) for end in ends for mine, theirs in rates]
 

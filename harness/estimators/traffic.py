@@ -34,6 +34,11 @@ with 0.02 by more than a factor of 3 (`python -m benchmarks.other_traffic`)."""
 Ends = tuple[float, Number]
 
 
+def mean_share(p: FloatArray, share: FloatArray) -> float:
+    """``share`` of tests that crash (S,), averaged over what strata add to the rate; 1 where none has crashed."""
+    return float(p @ share**2 / (p @ share)) if share.any() else 1.0
+
+
 @dataclass(frozen=True)
 class Uncertain:
     """A rate, or its ratio to another: interval of the sampling error, of the ``environment``, and of both.

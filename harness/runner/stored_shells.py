@@ -23,7 +23,7 @@ from harness.errors import CampaignError, RunFolderError
 from harness.estimators.block import Block
 from harness.estimators.likelihood import Level, likelihood_limit
 from harness.estimators.shells import SeenShells
-from harness.estimators.traffic import LEAST_SHARE
+from harness.estimators.traffic import LEAST_SHARE, mean_share
 from harness.numbers import share
 from harness.pool.build import campaign_pool
 from harness.pool.moved import FewPaths, OnPaths, environment_with, ranges, ratio_of
@@ -95,9 +95,8 @@ class StoredShells:
 
     @property
     def mean_share(self) -> float:
-        """Share of tests that crash, averaged over what each stratum adds to the rate; 1 where nothing has crashed."""
-        share, p = self.seen.tally.share, self.tested.p
-        return float(p @ share**2 / (p @ share)) if share.any() else 1.0
+        """See `harness.estimators.traffic.mean_share`."""
+        return mean_share(self.tested.p, self.seen.tally.share)
 
     @property
     def holds(self) -> bool:
