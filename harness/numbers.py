@@ -88,6 +88,11 @@ def count(value: float | None) -> str:
     return MISSING if value is None or math.isnan(value) else f"{value:,.0f}"
 
 
+def tests(n: int) -> str:
+    """``1 test``, or ``2,000 tests``."""
+    return f"{count(n)} test{'s' * (n != 1)}"
+
+
 def tenths(value: float) -> str:
     """A measured quantity; a dash where it was not recorded."""
     return MISSING if math.isnan(value) else f"{value:,.1f}".replace("-", MINUS)

@@ -81,7 +81,8 @@ def read_text(path: Path) -> str:
         meant = did_you_mean(path.name, [file.name for file in path.parent.glob("*.y*ml")])
         found, mend = "no such file", meant or "Check the spelling and the folder that you are in."
     except IsADirectoryError:
-        found, mend = "a folder", "Name the file inside it."
+        of_run = path / "campaign.yaml"
+        found, mend = "a folder", f"Write {of_run}." if of_run.is_file() else "Name the file inside it."
     except UnicodeDecodeError as error:
         found, mend = f"bytes that are not UTF-8 (at byte {error.start})", "Save the file as UTF-8 text."
     except (OSError, ValueError) as error:

@@ -129,7 +129,9 @@ def run(
     ran = campaign_file.name == "campaign.yaml"  # which a run has written into its folder
     if resume and ran and any((campaign_file.parent / name).is_file() for name in ("manifest.json", FAMILIES)):
         folder = folder or campaign_file.parent
-    folder = folder or options.run_folder(campaign, resume=resume)
+    if folder is None:
+        folder = options.run_folder(campaign, resume=resume)
+        say(f"into {folder}", err=True)
     if resume and not holds_tests(folder):
         say(f"note: nothing to resume in {folder}: starts anew", err=True)
     if campaign.run.executor == "local":

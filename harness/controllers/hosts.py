@@ -80,6 +80,8 @@ def cause_of(error: BaseException) -> str:
         if str(origin).partition(".")[0] in ("traci", "libsumo"):  # not what stands for it here
             text = f"{text.rstrip('.')}. Use the traci that is handed in (docs/controllers.md), not the module"
         kind = type(error.obj) if isinstance(error, AttributeError) else object
+        if isinstance(error, TypeError) and "tuple indices must be" in text:
+            text += ". What is seen has fields: seen.gap_m, not seen['gap_m']"
         if isinstance(error, AttributeError) and str(kind.__module__).startswith("harness."):
             text += f". {did_you_mean(error.name, [name for name in dir(kind) if name[0] != '_'])}".rstrip(". ")
     except BaseException as again:  # noqa: BLE001 - whatever a user's code raises

@@ -11,6 +11,7 @@ from harness.estimators.block import BRAKED_MPS2
 from harness.estimators.estimate import finite_json
 from harness.estimators.limits import clopper_pearson
 from harness.loop.cells import FAR_BEHIND_S
+from harness.numbers import tests
 from harness.report.words import BRAKES_BEFORE, NEVER_BRAKED, cruise_words, late_words
 from harness.shown import ShownInPython
 
@@ -180,7 +181,7 @@ def _doubts(check: AvCheck) -> Iterator[str]:
     if follows is not None and follows.n_hit:
         yield f"in {follows.n_hit} of {check.n_episodes} tests it hit the vehicle ahead before anything happened."
     if check.shows and behaviour.n_braked_before:
-        yield f"{cruise_words([BRAKES_BEFORE.format(behaviour.n_braked_before)], script=check.script)}."
+        yield f"{cruise_words([BRAKES_BEFORE.format(tests(behaviour.n_braked_before))], script=check.script)}."
     if follows is not None and follows.headway_s > FAR_BEHIND_S:
         behind = f"{follows.headway_s:.1f} s behind the vehicle ahead"
         yield f"when the event begins it is {behind}, which makes that milder: let it keep up."

@@ -130,7 +130,8 @@ def sum_warnings(content: Mapping[str, Any]) -> Iterator[str]:
         if ranges and (high >= decision["limit"] if verdict == "accepted" else low <= decision["limit"]):
             sign, as_text = ("× ", ratio) if decision["driver"] else ("", number)
             most = "no limit" if math.isinf(high) else as_text(high)
-            yield f"assumed numbers may turn this verdict: {sign}{as_text(low)} to {most} over their ranges"
+            sampled = " with sampling error" * bool(decision.get("over_assumed"))
+            yield f"assumed numbers may turn this verdict:{sampled} {sign}{as_text(low)} to {most} over their ranges"
     yield from words.runs_warning(decision)
     for reading in content["readings"]:
         if _side(reading) != _side(content["beside"]):
@@ -194,7 +195,8 @@ def _scope(content: Mapping[str, Any]) -> str:
         rhw = content["per_hour"]["rhw"]
         ended += f"{'' if rhw is None else words.reached_words(rhw, share(rhw))} (asked: ± {share(target)})"
     if content["stopped_by"] == "episodes" and (target is not None or content["decision"] is not None):
-        ended += words.go_on(content["n_episodes"], content["n_crashes"], content["decision"])
+        further = (rhw / target) ** 2 if target and (rhw := content["per_hour"]["rhw"]) else math.inf
+        ended += words.go_on(content["n_episodes"], content["n_crashes"], content["decision"], further)
     counted = ", that of the sum also of counted events," if content["counts_in_interval"] else ""
     return words.scope_words(content["confidence"], ended, counted)
 

@@ -22,7 +22,19 @@ from harness.estimators.limits import clopper_pearson
 from harness.estimators.severity import TOUCH_MPS
 from harness.families import family_named
 from harness.loop.cells import FAR_BEHIND_S
-from harness.numbers import WIDEST_RHW, count, duration, interval, leaves, number, plain, share, two_digits_up, words
+from harness.numbers import (
+    WIDEST_RHW,
+    count,
+    duration,
+    interval,
+    leaves,
+    number,
+    plain,
+    share,
+    tests,
+    two_digits_up,
+    words,
+)
 from harness.report.notes import note_words
 from harness.report.rows import Row, end, held_back, ratio_warning, rows_of, too_few, with_traffic
 from harness.sampling.paths import n_left_out
@@ -80,7 +92,7 @@ def short_answer(campaign: Campaign, manifest: Mapping[str, Any], estimates: Est
 
 def tests_words(n: int, engine: str, scenario: str) -> str:
     """How many tests, and of what."""
-    return f"{count(n)} tests in {'SUMO' if engine == 'sumo' else 'SUMO’s twin'}, {scenario}"
+    return f"{tests(n)} in {'SUMO' if engine == 'sumo' else 'SUMO’s twin'}, {scenario}"
 
 
 def vehicle_words(av: AutomatedVehicle, *, script: float | None = None) -> tuple[str, list[tuple[str, str]]]:
@@ -157,7 +169,7 @@ def warnings_of(scenario: str, result: Mapping[str, Any], unit: str, but: str = 
         )
     if n := result[EARLY]:
         yield (
-            f"{count(n)} tests crashed BEFORE the event, as it just followed: it does so in all driving, which "
+            f"{tests(n)} crashed BEFORE the event, as it just followed: it does so in all driving, which "
             "this rate leaves out (testing.method=nde counts it)"
         )
     yield from map(note_words, result["cautions"])
@@ -212,8 +224,8 @@ def runs_warning(decision: Mapping[str, Any] | None) -> Iterator[str]:
         yield f"its baseline runs may miss what it does in one of many drives, which may be above the limit: {more}"
 
 
-NEVER_BRAKED = f"it never braked with {plain(BRAKED_MPS2)} m/s² or more: does it see the other vehicle?"
-BRAKES_BEFORE = "in {} tests it braked with nobody ahead, which makes the event milder"
+NEVER_BRAKED = f"it never braked with {plain(BRAKED_MPS2)} m/s² or more (below 0): does it see the other vehicle?"
+BRAKES_BEFORE = "in {} it braked with nobody ahead, which makes the event milder"
 
 
 def late_words(*, script: bool) -> str:
@@ -236,16 +248,16 @@ def _acts(before: Mapping[str, Any] | None) -> Iterator[str]:
         yield NEVER_BRAKED
     if (n := before["n_fell_behind"]) > MANY * before["n_events"] and not before["built_in"]:
         why = "which makes the event milder: let it keep up"
-        yield f"in {count(n)} tests it was over {FAR_BEHIND_S:g} s behind the vehicle ahead when the event began, {why}"
+        yield f"in {tests(n)} it was over {FAR_BEHIND_S:g} s behind the vehicle ahead when the event began, {why}"
     if not before["waits"]:
         return
     if before["source"] in ("sumo", "traci"):
         yield "SUMO changes lanes in one step: this vehicle cannot see the other car (BV) coming over, as drivers can"
     elif before["n_events"] and not before["n_took_over_early"]:
         yield late_words(script=before["script"])
-    did = [BRAKES_BEFORE.format(count(n))] if (n := before["n_braked_before"]) else []
+    did = [BRAKES_BEFORE.format(tests(n))] if (n := before["n_braked_before"]) else []
     if (n := before["n_asked_to_speed_up"]) and not before["built_in"]:  # our own models do, which is known
-        did.append(f"in {count(n)} tests it asked to speed up before BV was in its lane, and its speed was held")
+        did.append(f"in {tests(n)} it asked to speed up before BV was in its lane, and its speed was held")
     if did:
         yield cruise_words(did, script=before["script"])
 
@@ -262,7 +274,8 @@ def _scope(campaign: Campaign, manifest: Mapping[str, Any], estimates: Estimates
         reached = reached_words(rhw, width)
         if not best.n_crashes or best.cautions:
             reached = ", precision not known" if best.n_crashes else ", no crash seen"
-        more = go_on(best.n_episodes) if stopped_by == "episodes" else remedy_words(manifest.get("remedy"))
+        further = go_on(best.n_episodes, further=(rhw / target) ** 2 if best.n_crashes else math.inf)
+        more = further if stopped_by == "episodes" else remedy_words(manifest.get("remedy"))
         more = "" if manifest.get("expected") and best.n_crashes else more  # `width_row` has it
         ended += f"{reached} (asked: ± {share(target)}){more}"
     elif stopped_by == "episodes":
@@ -276,14 +289,18 @@ def _scope(campaign: Campaign, manifest: Mapping[str, Any], estimates: Estimates
     return f"a test is {test}; {scope_words(best.confidence, ended)}"
 
 
-def go_on(n: int, n_crashes: int = 0, decision: Mapping[str, Any] | None = None) -> str:
-    """How to go on after a budget of ``n`` tests is used up, and how many would decide if none of them crashes."""
+def go_on(n: int, n_crashes: int = 0, decision: Mapping[str, Any] | None = None, further: float = 2.0) -> str:
+    """How to go on after a budget of ``n`` tests is used up, and how many would decide if none of them crashes.
+
+    ``further`` is how many times as many may do, infinite where that is not known.
+    """
     if decision is None:
-        return f"; go on with --resume --set stop.episodes={2 * n}"
+        more = two_digits_up(n * min(max(further, 2.0), MOST_FURTHER))
+        return f"; the same command with --resume --set stop.episodes={more} goes on"
     times = end(decision["high"]) / decision["limit"]  # without a crash an upper limit falls with 1/n, or faster
     decidable = not n_crashes and 1.0 < times < math.inf
     enough = f": without a crash at most some {count(two_digits_up(n * times))} tests decide" if decidable else ""
-    return f"; go on with --accept as before, --resume --set stop.episodes={2 * n}{enough}"
+    return f"; the same command with --resume --set stop.episodes={2 * n} goes on{enough}"
 
 
 def reached_words(rhw: float, width: str) -> str:
@@ -320,6 +337,8 @@ def elsewhere_words(elsewhere: Elsewhere) -> str:
 
 # -- for a terminal: some nine lines of 100 columns --
 
+MOST_FURTHER = 10.0
+"""Times the tests done that are told as those to go on with, at most [assumed]."""
 WIDTH, LINES, LABEL = 100, 9, 26
 MOST_WARNINGS = 3
 

@@ -216,6 +216,12 @@ def test_files_that_are_refused_as_a_whole(read, tmp_path, content, words):
         read_yaml(tmp_path / content) if isinstance(content, Path) else read(content)
 
 
+def test_the_folder_of_a_run_is_told_by_its_campaign(tmp_path):
+    (tmp_path / "campaign.yaml").touch()
+    with pytest.raises(CampaignError, match=rf"a folder; .*Write {tmp_path}/campaign\.yaml"):
+        read_yaml(tmp_path)
+
+
 def test_byte_order_mark_is_no_content(read):
     assert read(b"\xef\xbb\xbfa: 1")[0] == {"a": 1}
 

@@ -15,6 +15,7 @@ from harness.campaign.vehicle import Limits
 from harness.cli import main
 from harness.controllers.find import build_host
 from harness.controllers.hosts import Guard, _numbers, optional
+from harness.controllers.protocol import Neighbour
 from harness.errors import EXIT_BAD_INPUT, EXIT_DONE, EXIT_TOO_MANY_FAILED
 from harness.printed import PRINTED
 from harness.runner.workers import LocalWorkers
@@ -273,6 +274,12 @@ def test_a_start_that_is_async_or_yields_has_failed_since_nothing_of_it_was_run(
     with Guard(Limits()) as guard:
         found = [guard.call(optional("start", None), SimpleNamespace(start=start)) for start in (later, parts)]
     assert found == 2 * [(None, "TypeError: start is async, or yields: nothing of it was run")]
+
+
+def test_one_that_reads_what_is_seen_as_a_dictionary_is_told_how():
+    with Guard(Limits()) as guard:
+        _, why = guard.call(lambda seen: seen["gap_m"], Neighbour(9.0, 20.0, 0))
+    assert "indices must be integers or slices, not str. What is seen has fields: seen.gap_m, not" in why
 
 
 def test_a_call_whose_time_is_over_at_once_has_failed_like_any_that_is_late(monkeypatch):

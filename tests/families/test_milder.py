@@ -160,7 +160,7 @@ def test_one_that_makes_the_events_milder_itself_is_told_so_and_not_accepted(tmp
     assert estimates["decision"]["n_milder"] == estimates["diagnostics"]["n_fell_behind"] > 100
     told = " ".join(capsys.readouterr().out.split())
     assert "yet not accepted, see !" in told
-    assert "it never braked with 1 m/s² or more: does it see the other vehicle?" in told
+    assert "it never braked with 1 m/s² or more (below 0): does it see the other vehicle?" in told
 
 
 @pytest.mark.parametrize(

@@ -225,5 +225,10 @@ def test_a_decision_without_an_upper_end_is_written_and_told(low, told):
 )
 def test_what_an_undecided_limit_takes_is_told_where_none_crashed(n_crashes, high, said):
     told = go_on(3000, n_crashes, {"high": high, "limit": 1.0})
-    assert told.startswith("; go on with --accept as before, --resume --set stop.episodes=6000")
+    assert told.startswith("; the same command with --resume --set stop.episodes=6000 goes on")
     assert told.endswith(": without a crash at most some 7,800 tests decide") == said
+
+
+@pytest.mark.parametrize(("further", "n"), [(1.2, 6000), (4.01, 13_000), (math.inf, 30_000)])
+def test_what_a_precision_takes_is_told_where_the_budget_ended_before(further, n):
+    assert f"stop.episodes={n} " in go_on(3000, further=further)

@@ -153,7 +153,7 @@ def test_a_limit_ends_it_with_a_decision(tmp_path, changes, code, verdict):
     assert (found["driver"] == "r157-cc") == ("r157-cc" in row["value"]) == ("r157-cc" in changes[0])
     assert (decided.stopped_by == "accept") == (code != 4)
     assert estimate(decided.folder)["decision"] == found
-    how = "go on with --accept as before, --resume --set stop.episodes=600"
+    how = "the same command with --resume --set stop.episodes=600 goes on"
     assert (how in answer_in(decided.folder)["scope"]) == (code == 4)
     if code == 5:
         assert row["value"] in write_report(decided.folder).read_text(encoding="utf-8")
