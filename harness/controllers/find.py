@@ -16,6 +16,7 @@ from importlib.util import module_from_spec, spec_from_file_location
 from inspect import Parameter, Signature, isfunction, signature
 from operator import methodcaller
 from pathlib import Path
+from threading import RLock
 from types import ModuleType, SimpleNamespace
 from typing import Any, TypeVar
 
@@ -38,6 +39,7 @@ from harness.processes import Child, WorkerDeath, first_to_answer, tell
 from harness.vehicles.kinematics import STEP_S
 
 _Answer = TypeVar("_Answer")
+_RUNNING = RLock()  # a file: surrogates' tables are made side by side, and none may see half of it
 _tell_once = cache(lambda note: sys.stderr.write(f"note: {note}.\n"))
 
 
@@ -92,16 +94,16 @@ def source_of_own(name: str, where: str) -> str:
 def _of_file(file: Path) -> ModuleType:
     """The module that a file makes; its name is not that of another file, or of an installed module, of this name."""
     name = f"{file.stem}_{hashlib.sha256(bytes(real_path(file))).hexdigest()[:8]}"
-    if name not in sys.modules:
-        loader = FromSource(name, str(file))
-        spec = spec_from_file_location(name, file, loader=loader)
-        assert spec is not None
-        sys.modules[name] = module_from_spec(spec)
-        try:
-            loader.exec_module(sys.modules[name])
-        except BaseException:
-            del sys.modules[name]
-            raise
+    with _RUNNING:
+        if name not in sys.modules:
+            spec = spec_from_file_location(name, file, loader=FromSource(name, str(file)))
+            assert spec and spec.loader
+            sys.modules[name] = module_from_spec(spec)
+            try:
+                spec.loader.exec_module(sys.modules[name])
+            except BaseException:
+                del sys.modules[name]
+                raise
     return sys.modules[name]
 
 

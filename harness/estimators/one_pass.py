@@ -75,19 +75,18 @@ class OwnState(Nade):
 
     def add(self, block: Block) -> None:
         super().add(block)
-        self._call(self._own.add, block)
+        self._call(self._own.add, deepcopy(block))  # the others' arrays are not its own to write to
 
     def result(self, confidence: float) -> Estimate:
         """Its own estimate, or one with a normal interval, our cautions and our upper bound."""
-        estimate = self._call(self._own.result, confidence)
-        if not isinstance(estimate, Estimate):
-            rate = std_error = math.nan
-            with suppress(TypeError, ValueError):
-                rate, std_error = map(float, estimate)
-            if not (math.isfinite(rate) and 0.0 <= std_error < math.inf):
-                expected = "a rate and its standard error, or an Estimate"
-                raise HarnessError(f"{self._name}, result", repr(estimate), expected, "Fix what it returns.")
-            estimate = self.estimate(rate, std_error, None, confidence)
+        found = self._call(self._own.result, confidence)
+        is_whole, rate, spread = isinstance(found, Estimate), math.nan, math.nan
+        with suppress(TypeError, ValueError):
+            rate, spread = (found.crash_rate, found.ci_high - found.ci_low) if is_whole else map(float, found)
+        if not (math.isfinite(rate) and 0.0 <= spread < math.inf):
+            expected = "a rate and its standard error, or an Estimate, of numbers"
+            raise HarnessError(f"{self._name}, result", repr(found), expected, "Fix what it returns.")
+        estimate = found if is_whole else self.estimate(rate, spread, None, confidence)
         return replace(estimate, warnings=(*estimate.warnings, note("own")))
 
     def _call(self, work: Callable[..., Any], *arguments: Any) -> Any:
@@ -163,12 +162,13 @@ def _own(asked: Any, where: str) -> OwnEstimator:
         made = own_code(installed.get(asked, asked), where, wanted)
     if missing := [each for each in ("methods", "add", "result") if not hasattr(made, each)]:
         raise HarnessError(where, f"{name} without {' and '.join(missing)}", wanted, "Add what is missing.")
-    if isinstance(made.methods, str) or not {*made.methods} <= {*METHODS} - {"shells"}:
-        weighted = listed(each for each in METHODS if each != "shells")
-        expected = f"those of {weighted} whose tests it can use; shells have no weights"
+    weighted = [each for each in METHODS if each != "shells"]
+    methods = made.methods if isinstance(made.methods, list | tuple | set) else ()
+    if not methods or not all(each in weighted for each in methods):
+        expected = f"those of {listed(weighted)} whose tests it can use; shells have no weights"
         mend = 'Write methods = ("forced",), say. Weights have mean 1 only where a method can draw every test.'
         raise HarnessError(where, f"{name} with methods {made.methods!r}", expected, mend)
-    return OwnEstimator(name, made if isinstance(made, type) else partial(deepcopy, made), tuple(made.methods))
+    return OwnEstimator(name, made if isinstance(made, type) else partial(deepcopy, made), tuple(methods))
 
 
 def headline_of(campaign: Campaign) -> AnyEstimator:

@@ -197,7 +197,7 @@ class Nade:
         below, above = skewed_distances(std_error, third_moment or 0.0, tail)
         if self.n_crashes == self.n:  # equal weights then show no spread
             below = max(below, rate * (1.0 - float(clopper_pearson(self.n, self.n, tail)[0])))
-        low, high, half = min(max(0.0, rate - below), 1.0), min(1.0, rate + above), (below + above) / 2.0
+        low, high, half = min(max(0.0, rate - below), 1.0), min(max(0.0, rate + above), 1.0), (below + above) / 2.0
         if self.n_crashes == 0:
             low, high = 0.0, capped_mean_upper(0.0, cap, self.n, (1.0 + confidence) / 2.0)
         upper, settled = hoeffding, self.is_settled()

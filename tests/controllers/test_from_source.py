@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import py_compile
 import sys
+from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
@@ -61,3 +62,11 @@ def test_nor_of_what_lies_beside_a_script(rewritten):
     shard = drive(f"av={{controller: '{file}'}}", n=4)
     assert shard.failures == {}
     assert min(trace[:-1, 2, 2].min() for trace in shard.traces.values()) == -2.0
+
+
+def test_nobody_sees_half_of_a_file_that_another_thread_runs(tmp_path):
+    file = tmp_path / "slow.py"
+    file.write_text("import time\n\ntime.sleep(0.2)\n\n\ndef challenge():\n    return 0.5\n")
+    with ThreadPoolExecutor(3) as threads:
+        found = list(threads.map(own_code, [f"{file}:challenge"] * 3))
+    assert [each() for each in found] == [0.5] * 3

@@ -1,6 +1,7 @@
 """One pass feeds all estimators in order, the user's own too; the content of ``estimates.json``."""
 
 import json
+import math
 
 import numpy as np
 import pyarrow as pa
@@ -242,6 +243,9 @@ def test_a_failed_episode_may_lack_its_weight_and_its_moments(tables):
 
 
 CODE = """
+from harness.estimators.estimate import Estimate
+
+
 class Mean:
     methods = "step_mixture", "episode_mixture"
 
@@ -268,8 +272,28 @@ class Nothing(Mean):
         return float("nan"), 1.0
 
 
+class UpsideDown(Mean):
+    def result(self, confidence):
+        return Estimate(1.0, 0.0, 0.9, 0.1, 1.0, confidence, 0.1, self.n, 1, 1.0, 1.0, "normal", "one_sided")
+
+
+class Writes(Mean):
+    def add(self, block):
+        super().add(block)
+        block.log_weight[:], block.outcome[:] = 0.0, 0
+
+
+class Below(Mean):
+    def result(self, confidence):
+        return -0.5, 0.1
+
+
 class Anywhere(Mean):
     methods = "shells",
+
+
+class Three(Mean):
+    methods = 3
 
 
 class NoResult:
@@ -298,6 +322,16 @@ def test_it_is_ours_with_a_normal_interval_and_is_told_what_tests_are_drawn_by(f
     assert theirs.interval == "normal"
 
 
+def test_others_are_the_same_beside_one_that_writes_into_its_blocks(file):
+    found = one_pass([block([True, False], [-3.0, -2.0])], [one(file, "Writes"), "nade"]).estimates
+    assert found["nade"].crash_rate == pytest.approx(math.exp(-3.0) / 2.0)
+
+
+def test_an_interval_of_a_negative_rate_ends_at_0(file):
+    found = one_pass([block([True, False])], [one(file, "Below")]).estimates["mine.py:Below"]
+    assert (found.ci_low, found.ci_high) == (0.0, 0.0)
+
+
 def test_one_answers_for_a_campaign_draws_its_course_and_stops_it(file, tmp_path):
     campaign = golden("mixture-twin", "stop.rhw=0.9", f"testing.estimator={file}:Mean")
     assert headline_of(campaign).name == "mine.py:Mean"
@@ -317,7 +351,9 @@ def test_one_answers_for_a_campaign_draws_its_course_and_stops_it(file, tmp_path
     [
         ("Raises", r"ZeroDivisionError: no weight \(.*mine.py:\d+\)", "Fix the class"),
         ("Nothing", r"\(nan, 1.0\)", "Fix what it returns"),
+        ("UpsideDown", "ci_low=0.9, ci_high=0.1", "Fix what it returns"),
         ("Anywhere", "methods .*'shells'", "Write methods ="),
+        ("Three", "methods 3", "Write methods ="),
         ("NoResult", "NoResult without result", "Add what is missing"),
         ("Meen", "no class or function Meen", "Did you mean 'Mean'"),
     ],
