@@ -96,11 +96,12 @@ def _of_file(file: Path) -> ModuleType:
     name = f"{file.stem}_{hashlib.sha256(bytes(real_path(file))).hexdigest()[:8]}"
     with _RUNNING:
         if name not in sys.modules:
-            spec = spec_from_file_location(name, file, loader=FromSource(name, str(file)))
-            assert spec and spec.loader
+            loader = FromSource(name, str(file))
+            spec = spec_from_file_location(name, file, loader=loader)
+            assert spec is not None
             sys.modules[name] = module_from_spec(spec)
             try:
-                spec.loader.exec_module(sys.modules[name])
+                loader.exec_module(sys.modules[name])
             except BaseException:
                 del sys.modules[name]
                 raise
