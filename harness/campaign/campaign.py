@@ -137,8 +137,8 @@ class Campaign(Section):
 
     @property
     def importance_names(self) -> tuple[str, ...]:
-        """Names of the importance functions, in the order of ``log_q``."""
-        defensive = ("forced",) if self.sampling.forces else ()
+        """Names of the importance functions, in the order of ``log_q``, none of them twice."""
+        defensive = ("forced cut-ins" if "forced" in self.surrogates else "forced",) if self.sampling.forces else ()
         return defensive + (tuple(self.surrogates) if self.sampling.mixes else ())
 
     @property

@@ -321,3 +321,8 @@ def test_the_commands_take_a_vehicle(tmp_path, capsys, monkeypatch):
     assert [campaign.av for campaign in seen] == [AutomatedVehicle(), load_panel().avs["SM-II"]]
     assert main(["run", str(file), "--out", str(tmp_path / "r"), "--av", "nobody"]) == 2
     assert capsys.readouterr().err.startswith("error: --av nobody\n")
+
+
+def test_a_surrogate_named_forced_is_told_from_forced_cut_ins():
+    given = {"name": "x", "testing": {"method": "episode_mixture"}, "surrogates": {"forced": {"model": "idm"}}}
+    assert Campaign.model_validate(given).importance_names == ("forced cut-ins", "forced")
