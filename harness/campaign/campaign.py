@@ -9,6 +9,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Callable
+from itertools import starmap
 from typing import Annotated, Any, Literal, NamedTuple, Self
 
 from pydantic import BeforeValidator, Field, SerializeAsAny, model_validator
@@ -33,7 +34,7 @@ from harness.campaign.sections import (
     Whole,
     WorldSettings,
 )
-from harness.campaign.vehicle import AutomatedVehicle
+from harness.campaign.vehicle import WAITS, AutomatedVehicle
 from harness.problems import NAME_PATTERN, broken_rule, did_you_mean, listed
 from harness.vocabulary import SAMPLING, Sampling
 
@@ -107,7 +108,7 @@ class Campaign(Section):
         changes: dict[str, Any] = {}
         if name != DEFAULT_FAMILY:  # in the others the vehicle drives from the start in any case
             own = EnvironmentSettings(parameters=self.environments.get(name, DEFAULT))
-            changes = {"environment": own, "av": self.av.replaced(("before_event",), "hold_speed")}
+            changes = {"environment": own, "av": self.av.model_copy(update=WAITS)}
         stop = self.stop.model_copy(update={"each_family": False})
         return self.model_copy(
             update={"scenario": name, "scenarios": None, "exposure": {}, "environments": {}, "stop": stop, **changes}
@@ -202,6 +203,13 @@ class Combination(NamedTuple):
 
 
 _FOLLOWS = "in {scenario}, where the AV follows a vehicle from the start"
+
+
+def _waits(key: str, usual: Any) -> Combination:
+    found, expected = f"{{av.{key}}}, {_FOLLOWS}", f"{usual}, which means nothing there: the vehicle drives in any case"
+    differs = lambda c, use: use.follows and getattr(c.av, key) != usual  # noqa: E731 - as in the table
+    return Combination(f"av.{key}", differs, found, expected, "Delete the key.")
+
 
 REFUSED = (
     # -- limits --
@@ -314,11 +322,7 @@ REFUSED = (
         "shells, forced or nde: importance functions are those of cut-ins of one step",
         "Choose shells; or, of cut_in, add --set environment.parameters=ndd-overtaking-1.",
     ),
-    Combination(
-        "av.before_event", lambda c, use: use.follows and c.av.acts_before_event,
-        "controller, " + _FOLLOWS,
-        "hold_speed, which means nothing there: the vehicle drives in any case", "Delete the key.",
-    ),
+    *starmap(_waits, WAITS.items()),
     Combination(
         "av.model", lambda c, use: use.follows and c.av.model == "r157-fsm",
         "r157-fsm, " + _FOLLOWS,

@@ -198,6 +198,10 @@ class AutomatedVehicle(Section):
         return self
 
 
+WAITS = {key: AutomatedVehicle.model_fields[key].default for key in ("before_event", "takes_over", "warm_up_s")}
+"""What a vehicle does until the event, and is usual; all of it means nothing where it follows from the start."""
+
+
 class Panel(Section):
     """Automated vehicles by name: ``av`` sections that experiments, tests and tables share."""
 
