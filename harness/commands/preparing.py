@@ -54,8 +54,11 @@ def fit(files: Sequence[Path], out: Path, *, replicates: int, as_json: bool, **o
     if as_json:
         print_json({"files": names, **fitted.facts})
     else:
-        setting = shlex.quote(f"environment.parameters={out}")
-        say(*fitted.told, *names, f"next: harness run my_av.py:MyAV --set {setting}")
+        run, first = "harness run my_av.py:MyAV", f"--set {shlex.quote(f'environment.parameters={out}')}"
+        yamls = {name: file for name, each in fitted.families.items() for file in each.files if file.suffix == ".yaml"}
+        others = [shlex.quote(f"environments.{name}={file}") for name, file in yamls.items() if file != out]
+        all_of_them = f"or: {run} --scenario all {' --set '.join([first, *others])}"
+        say(*fitted.told, *names, f"next: {run} {first}", *([all_of_them] if others else []))
 
 
 @click.command(

@@ -47,7 +47,11 @@ def test_a_fit_is_read_whatever_it_is_called_and_the_same_seed_gives_the_same_by
     assert "! only 5 replicates (a 90 % interval needs at least 20)" in out
     assert "cut_in: exposure is not fitted: kept is 0.048 per hour" in out
     assert "noise of" not in out
-    assert out.endswith("next: harness run my_av.py:MyAV --set 'environment.parameters=again/a #1: b.yaml'\n")
+    mine = "harness run my_av.py:MyAV{} --set 'environment.parameters=again/a #1: b.yaml'"
+    for name in ("lead_brakes", "cut_out"):
+        mine += f" --set 'environments.{name}=again/a #1: b.{name}.yaml'"
+    alone, _, _ = mine.format("").partition(" --set 'environments.")
+    assert out.endswith(f"next: {alone}\nor: {mine.format(' --scenario all')}\n")
     again = list((tmp_path / "again").iterdir())
     assert len(again) >= 3
     for file in again:
