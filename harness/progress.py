@@ -132,7 +132,7 @@ def _words(task: Task) -> str:
     ]
     done, took_s = task.completed - task.fields["before"], task.elapsed or 0.0
     if done <= 0 or not took_s:
-        return " · ".join([*figures, *([] if took_s < 1.0 else [f"since {duration(took_s)}"])])
+        return " · ".join([*figures, *([] if took_s < 1.0 else [f"for {duration(took_s)}"])])
     s_each = took_s / done
     rate = f"{count(1.0 / s_each)}/s" if s_each < 1.0 else f"{duration(s_each)} each"
     missing = 0.0 if task.total is None else task.total - task.completed

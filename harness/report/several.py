@@ -214,10 +214,11 @@ def pair_words(decision: Mapping[str, Any]) -> str:
         of_safer = {"proven": of_b, "refuted": of_a, "open": held}[verdict]
         return verdicts.get(verdict, "Not told apart") + ", see !" * bool(of_safer)
     most = share(margin)
-    # Of B / A; told as all else, of A / B.
-    high, low = ("" if not end else ratio(1.0 / end) for end in decision.get("ratio") or (None, None))
+    ends = decision.get("ratio") or (None, None)  # of B / A; told as all else, of A / B
+    high, low = ("" if not end else ratio(1.0 / end) for end in ends)
     if verdict == "proven":
-        return f"B is at most {most} worse than A" + f" (A / B ≥ {low})" * bool(low)
+        safer = "B crashes less often than A, so it is" if (ends[1] or 1.0) < 1.0 else "B is"
+        return f"{safer} at most {most} worse than A" + f" (A / B ≥ {low})" * bool(low)
     if verdict == "refuted":
         return f"B is more than {most} worse than A" + f" (A / B ≤ {high})" * bool(high)
     between = f"{low} to {high}" if low and high else f"≥ {low}" if low else f"≤ {high}"

@@ -9,6 +9,7 @@ import math
 import os
 import shlex
 from collections import Counter
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -96,16 +97,18 @@ def typed(path: Path) -> str:
 def read_run_folder(path: Path, content: dict[str, Any] | None = None) -> RunFolder:
     """Read campaign, manifest, tests and, where they are not ``content``, estimates of a run."""
     manifest = read_manifest(path)
-    estimates = STORED_ESTIMATES.validate_python(content or _read_estimates(path, manifest["campaign_hash"]))
+    estimates = STORED_ESTIMATES.validate_python(content or _read_estimates(path, manifest))
     campaign = read_campaign(path, manifest)
     tests = ShownTests.stored(path, manifest, family_named(campaign.scenario))
     design = stored_design(path) if campaign.sampling.strata else None
     return RunFolder(path, campaign, manifest, estimates, design, tests, traffic_of(campaign, manifest))
 
 
-def _read_estimates(folder: Path, campaign_hash: str) -> Estimates:
+def _read_estimates(folder: Path, manifest: Mapping[str, Any]) -> Estimates:
     path, again = folder / "estimates.json", f"Make it with `harness estimate {folder} --write`."
-    estimates = read_as(Estimates, path, mend=again)
+    if not manifest["n_episodes"]:
+        again = "No test is finished: run `harness run` with --resume."
+    campaign_hash, estimates = manifest["campaign_hash"], read_as(Estimates, path, mend=again)
     if estimates.campaign_hash != campaign_hash:
         expected = f"those of campaign {campaign_hash} (manifest.json)"
         found = f"estimates of campaign {estimates.campaign_hash}"

@@ -231,7 +231,7 @@ BRAKES_BEFORE = "in {} it braked with nobody ahead, which makes the event milder
 def late_words(*, script: bool) -> str:
     """That a vehicle does nothing before BV is in its lane, and what would show it."""
     shows = "its getLateralLanePosition < 0" if script else "bv_lateral_m > 0"
-    return f"it did nothing before the other car (BV) was in its lane; {shows} shows it ~2 s earlier"
+    return f"it did nothing before the other car (BV) was in its lane; {shows} shows it earlier"
 
 
 def cruise_words(did: Sequence[str], *, script: bool) -> str:

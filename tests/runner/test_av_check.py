@@ -247,7 +247,7 @@ def test_a_slow_constructor_is_measured_and_counted(name):
 @pytest.mark.parametrize(("name", "late"), [("Waits", True), ("Steady", False)])
 def test_a_vehicle_that_waits_for_the_overlap_is_told_so(name, late):
     found = check_av(load_campaign(f"{__name__}:{name}", ["world.engine=twin"]), 6)
-    assert (found.shows, "bv_lateral_m > 0 shows it ~2 s earlier" in verdict(found)) == (True, late)
+    assert (found.shows, "bv_lateral_m > 0 shows it earlier" in verdict(found)) == (True, late)
     assert verdict(found).startswith("READY") == late  # the other one brakes with nobody ahead
 
 
