@@ -275,7 +275,7 @@ def not_moved_words(of: NotMoved) -> str:
     if not of.found:
         return f"Of {called} no test crashed: its bars move the competent driver alone, and no bar the upper limit."
     return (
-        f"Not moved: the numbers of {called}, {share(of.share)} of the rate (found: {of.found}; needed: {of.needed})."
+        f"Not moved: the numbers of {called} ({share(of.share)} of the rate). Found: {of.found}; needed: {of.needed}."
     )
 
 

@@ -227,9 +227,9 @@ def require_shares(tested: StoredShells) -> None:
     """Raise a `CampaignError` where shares may not be taken to stay the same."""
     if tested.holds:
         return
-    found = f"a vehicle that crashes on {share(tested.mean_share)} of the events of the shells that it crashes in"
-    expected = f"at least {share(LEAST_SHARE)}: else which these are may change with the traffic"
-    mend = "Run it in that environment, or here with a surrogate close to it in the library (pool.library)."
+    found = f"a vehicle that crashes on few ({share(tested.mean_share)}) of the events of its shells"
+    expected = f"at least {share(LEAST_SHARE)}, as which events these are may change with the traffic"
+    mend = "Run it in the other traffic (environment.parameters), or add a driver that is close to it (pool.library)."
     raise CampaignError(str(tested.folder), found, expected, mend)
 
 

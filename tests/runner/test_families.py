@@ -268,7 +268,7 @@ def test_what_moves_one_scenario_moves_the_sum_by_its_share(run, tmp_path, monke
     assert main(["sensitivity", str(folder), "--range", "braking.stop_share=0:0.1"]) == 0
     said = capsys.readouterr().out
     of = share(told["families"]["cut_out"]["share"])
-    left = f"Not moved: the numbers of cut-out, {of} of the rate (found: no number"
+    left = f"Not moved: the numbers of cut-out ({of} of the rate). Found: no number"
     assert left in said
     assert left in (folder / "report.html").read_text()
     assert "no test crashed" not in said
