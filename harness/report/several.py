@@ -131,7 +131,7 @@ def sum_warnings(content: Mapping[str, Any]) -> Iterator[str]:
             sign, as_text = ("× ", ratio) if decision["driver"] else ("", number)
             most = "no limit" if math.isinf(high) else as_text(high)
             sampled = " with sampling error" * bool(decision.get("over_assumed"))
-            yield f"assumed numbers may turn this verdict:{sampled} {sign}{as_text(low)} to {most} over their ranges"
+            yield f"assumed numbers may turn this verdict: {sign}{as_text(low)} to {most} over their ranges{sampled}"
     yield from words.runs_warning(decision)
     for reading in content["readings"]:
         if _side(reading) != _side(content["beside"]):

@@ -74,6 +74,12 @@ def test_a_law_with_a_number_that_no_environment_allows_is_named(tmp_path, monke
     overtaking(2.0).to_parquet(tmp_path / "rows.parquet", index=False)
     with pytest.raises(TrajectoryError, match=r"initial_state\.v_scale_mps.* 0\.0001"):
         fit_files([tmp_path / "rows.parquet"], tmp_path / "mine.yaml")
+    names = (*law.names, "initial_state__r1dot_df")
+    two = FittedLaw(names, lambda theta: np.repeat(theta, 2, axis=-1), found)
+    monkeypatch.setitem(LAWS, "speed", (lambda *_: two, "speeds of BV"))
+    with pytest.raises(TrajectoryError, match="2 problems") as caught:
+        fit_files([tmp_path / "rows.parquet"], tmp_path / "mine.yaml")
+    assert [each.found for each in caught.value.problems] == 2 * ["0.0001"]
 
 
 @pytest.mark.parametrize(

@@ -254,7 +254,7 @@ def test_a_vehicle_that_crashes_on_few_cut_ins_of_its_shells_is_refused(stored_r
     further = float(p @ ((share > 0.0) * (1.0 - share)))
     assert further > 0.0
     assert tested.limit(p, at_worst=True) == pytest.approx(tested.limit(p) + further, rel=0.05)
-    with pytest.raises(CampaignError, match="on few .* of the events of its shells"):
+    with pytest.raises(CampaignError, match=r"on few .* of the events of its shells"):
         shells_in(folder, mine)
 
 

@@ -81,9 +81,10 @@ def fit_traffic(traffic: ObservedTraffic, where: str, progress: Progress) -> Fit
         if df is not None:
             kept["degrees of freedom of R1dot"] = f"{df:g}: with heavier tails LV would exceed 100 m/s"
         return Fit(traffic, base, laws, kept, hazard, acceptance, environment)
-    words = f"laws that tests cannot be drawn from: {problem.where}, {problem.found}"
-    mend = f"The data do not look like motorway traffic; see docs/fit.md. {problem.mend}"
-    raise TrajectoryError(where, words, problem.expected, mend)
+    words = f"laws that tests cannot be drawn from, unlike those of motorways: {problem.where}, {problem.found}"
+    refused = TrajectoryError(where, words, problem.expected, f"See docs/fit.md. {problem.mend}")
+    refused.problems = problem.problems
+    raise refused
 
 
 def _rounded(value: float) -> float:
