@@ -268,7 +268,7 @@ def test_a_recording_is_named_and_left_out(tmp_path):
     pd.concat([others, street]).to_csv(tmp_path / "all.csv", index=False)
     for left_out, words in {
         (): r"most of it in recording street.*--leave-out 'street'",
-        ("street",): "lane changes to the target lane",
+        ("street",): "lane changes to the right",
         ("stret",): r"no recording stret; there are .*street",
     }.items():
         with pytest.raises(TrajectoryError, match=words):

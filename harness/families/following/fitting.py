@@ -155,7 +155,7 @@ class FollowingFitter:
         outside = not low <= shipped.value <= high
         remark = {"note": f"{shipped.note or shipped.source}; {EXCLUDED}: {n} in {hours:.4g} h of following"}
         content: Numbers = {"exposure": {"per_hour": shipped.model_dump(exclude_none=True) | remark}} if outside else {}
-        excluded = ", which these data exclude" if outside else ""
+        excluded = ", which these data exclude (--exposure takes your own)" if outside else ""
         line += f" ({limits} per hour)" * (hours > 0.0)
         line += f"; at least {FEWEST_COUNTED} are needed{needed}: kept is {number(shipped.value)} per hour"
         return content, f"{line} [{shipped.source}]{excluded}, and the law of {self.family.default_parameters}"

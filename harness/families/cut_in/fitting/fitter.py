@@ -82,8 +82,9 @@ def fit_traffic(traffic: ObservedTraffic, where: str, progress: Progress) -> Fit
             kept["degrees of freedom of R1dot"] = f"{df:g}: with heavier tails LV would exceed 100 m/s"
         return Fit(traffic, base, laws, kept, hazard, acceptance, environment)
     words = f"laws that tests cannot be drawn from, unlike those of motorways: {problem.where}, {problem.found}"
-    refused = TrajectoryError(where, words, problem.expected, f"See docs/fit.md. {problem.mend}")
-    refused.problems = problem.problems
+    refused = TrajectoryError(where, words, problem.expected, "See docs/fit.md.")
+    why = "It follows from the data: see docs/fit.md."  # no file to correct
+    refused.problems = tuple(TrajectoryError(each.where, each.found, each.expected, why) for each in problem.problems)
     raise refused
 
 

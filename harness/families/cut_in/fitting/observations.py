@@ -240,7 +240,8 @@ def require_enough(observations: Sequence[Observations], where: str, mapping: Ma
     overlapping, outside = total.overlapping_s / (total.followed_s or 1.0), total.outside_s / (total.driven_s or 1.0)
     hours = total.driven_s / 3600.0
     needed = f"some {hours * FEWEST_CHANGES / total.used:.2g} such hours are needed" if total.used else "they are rare"
-    closing = f"for {total.closing_s:.0f} s, and for {total.closing_other_s:.0f} s in the lane on the other side"
+    to, other = ("left", "right") if mapping.mirror else ("right", "left")
+    closing = f"for {total.closing_s:.0f} s, and for {total.closing_other_s:.0f} s in that to the {other}"
     rules: list[tuple[bool, str, str, str, str, str]] = [
         (total.driven_s == 0.0, "no vehicle with another lane beside it, on the side where vehicles close in",
          "lanes 0, 1, …", f"Check the columns of lanes and vehicles. {side}", "lane", ""),
@@ -257,12 +258,12 @@ def require_enough(observations: Sequence[Observations], where: str, mapping: Ma
          f"at most {MOST_OUTSIDE:.0%}", "Use recordings of flowing traffic: laws are fitted at 20 to 40 m/s.",
          "speed_mps", "outside_s"),
         (total.closing_s < max(LEAST_CLOSING_S, total.closing_other_s / OTHER_SIDE),
-         f"vehicles that close in from behind in the target lane (TTC < {CLOSING_TTC_S:g} s) {closing}",
-         "most of it in the target lane",
+         f"vehicles that close in from behind in the lane to the {to} (TTC < {CLOSING_TTC_S:g} s) {closing}",
+         f"most of it in the lane to the {to}",
          side if total.closing_other_s > total.closing_s else "Use recordings in which vehicles overtake.", "lane", ""),
         (total.used < FEWEST_CHANGES,
-         f"{total.used} lane changes to the target lane behind a leader within the fit range (of {total.changes} in "
-         f"all), in {hours:.1f} vehicle-hours beside the target lane",
+         f"{total.used} lane changes to the {to} behind a leader within the fit range (of {total.changes} in "
+         f"all), in {hours:.1f} vehicle-hours beside that lane",
          f"at least {FEWEST_CHANGES}", f"Add recordings: {needed}.", "", ""),
     ]  # fmt: skip
     for broken, *problem in rules:
