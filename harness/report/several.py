@@ -96,7 +96,7 @@ def beside_row(
 
 
 def family_rows(content: Mapping[str, Any]) -> Iterator[tuple[str, ...]]:
-    """A row each: key, name, share of the rate, crashes per hour, ratio (its limits if 1 is between them), how hard."""
+    """A row each: key, name, share of the rate, crashes per hour and ratio with their intervals, how hard."""
     order = sorted(content["families"].items(), key=lambda item: -(item[1]["rate_per_hour"] or 0.0))
     for name, family in order:
         per_hour, part, beside = family["rate_per_hour"], "0 %", "–"
@@ -105,15 +105,15 @@ def family_rows(content: Mapping[str, Any]) -> Iterator[tuple[str, ...]]:
             part = "" if family["share"] is None else share(family["share"])
             low, high = family["ci_low"], family["ci_high"]
             far = high is not None and high >= FAR_APART * low
-            rate = f"{number(per_hour)}  {between(low, high, per_hour)}"
+            rate = f"{number(per_hour)} (≥ {number(low)})" if high is None else interval(low, high, per_hour)
             if far:  # what is known is a limit
-                rate = f"< {number(high)}  estimate {number(per_hour)}"
-            beside = "–" if family["ratio"] is None else f"× {ratio(family['ratio'])}"
-            if family["ratio"] is not None and not _side(family):
-                most = "no limit" if family["ratio_high"] is None else number(family["ratio_high"], 2)
-                beside = f"× < {most}" if far else f"× {number(family['ratio_low'], 2)}–{most}"
+                rate = f"< {number(high)} ({number(per_hour)})"
+            if (times := family["ratio"]) is not None:
+                least, most = number(family["ratio_low"], 2), number(family["ratio_high"], 2)
+                ends = f"≥ {least}" if family["ratio_high"] is None else f"{least}–{most}"
+                beside = f"× < {most}" if far and not _side(family) else f"× {ratio(times)} ({ends})"
             if (unseen := _unseen(family)) is not None:
-                rate = f"< {number(unseen[1])}  {number(per_hour)} as fitted"
+                rate = f"< {number(unseen[1])} ({number(per_hour)} as fitted)"
         impact = family.get("median_impact_mps")
         hard = "no crash seen" if impact is None else f"median impact {tenths(impact)} m/s"
         yield name, called(name), part, rate, beside, hard
