@@ -61,11 +61,11 @@ def main(arguments: Sequence[str] | None = None, group: click.Group = cli, name:
             if (sent := interruption.signal) is not None or isinstance(error, click.Abort | KeyboardInterrupt):
                 show_interrupted(next(iter(arguments), ""), None if sent is None else sent.name)
                 return interruption.exit_code
-            return _told(error, group, name)
+            return _told(error, group, name, arguments)
         return code if isinstance(code, int) else EXIT_DONE
 
 
-def _told(error: Exception, group: click.Group, name: str) -> int:
+def _told(error: Exception, group: click.Group, name: str, arguments: Sequence[str]) -> int:
     """Show a user's error and return its exit code; a defect is raised again."""
     if isinstance(error, click.exceptions.NoArgsIsHelpError):
         error.show()
@@ -75,7 +75,10 @@ def _told(error: Exception, group: click.Group, name: str) -> int:
         return EXIT_DONE
     user_error = error if isinstance(error, HarnessError) else None
     if isinstance(error, click.UsageError):
-        user_error = usage_error(error, error.ctx or click.Context(group, info_name=name))
+        called = click.Context(group, info_name=name)
+        if (asked := next(iter(arguments), "")) in group.commands:  # click does not say which of a missing value
+            called = click.Context(group.commands[asked], called, asked)
+        user_error = usage_error(error, error.ctx or called)
     elif isinstance(error, OSError | MemoryError):
         user_error = system_error(error)
     if user_error is None:

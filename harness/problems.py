@@ -90,6 +90,8 @@ def _parts(details: ErrorDetails, section: type[BaseModel]) -> dict[str, str]:
         expected += ", or null" if field and len(loc) == 1 and type(None) in get_args(field.annotation) else ""
     if kind.startswith("less_than") and 0 in context.values():
         mend = f"Write {last}: -{value}."
+    elif kind.startswith("less_than") and 0.9 < next(iter(context.values())) <= 1.0 < value <= 100.0:  # per cent
+        mend = f"Write {last}: {value / 100.0:g}."
     return {"key": key, "found": found, "expected": expected, "mend": mend}
 
 
@@ -103,6 +105,8 @@ def _how_to_mend(value: Any, kind: str, field: FieldInfo | None) -> str:
         return "Write a value after the colon, or delete the key for its default."
     if kind in _NUMBERS and isinstance(value, str) and re.fullmatch(r"[-+.\d_eE]*\d[-+.\d_eE]*", value):
         return "Remove the quotes."
+    if kind in _NUMBERS and isinstance(value, str) and (percent := re.fullmatch(r"([\d.]*\d) *%", value)):
+        return f"Write {float(percent[1]) / 100.0:g}."
     if kind == "string_type" and isinstance(value, bool | int | float):
         return "Put it in quotes if it is meant as text."
     about = " ".join(field.description.split()) if field and field.description else ""

@@ -105,6 +105,8 @@ def test_wrong_calls_end_with_2(capsys, arguments):
         ("run --episodes 100", "Write --set stop.episodes=…"),
         ("run --seed 2", "Write --set seed=…"),
         ("run --output x", "Did you mean '--out'?"),
+        ("run --stop.rhw 0.1", "Write --set stop.rhw=…"),
+        ("run --set stop.rhw 0.1", "A setting is one word, as in --set stop.rhw=0.1"),
         ("compare", "Write harness compare idm OTHER_AV, or say with --against"),
     ],
 )
@@ -114,12 +116,18 @@ def test_what_is_no_option_or_has_no_value_is_told_with_what_to_write(asked, fix
     assert fix in capsys.readouterr().err.splitlines()[-1]
 
 
+def test_an_option_without_its_value_is_told_by_its_command(capsys):
+    assert main(["run", "idm", "--junit"]) == 2
+    assert capsys.readouterr().err.startswith("error: harness run\n  found:    Option '--junit' requires an arg")
+
+
 @pytest.mark.parametrize(
     ("asked", "said"),
     [
         ("run --scenario lead_brake", "fix:      Write --scenario lead_brakes."),
         ("run --scenario cut-in,lead_brake", "fix:      Write --scenario cut_in,lead_brakes."),
-        *((f"run --accept {wrong}", "accept.times_reference") for wrong in ("0.5xr157-cc", "50%", "0,5*r157-cc")),
+        *((f"run --accept {wrong}", "accept.times_reference") for wrong in ("0.5xr157-cc", "0,5*r157-cc")),
+        ("run --accept 50%", "expected: crashes per test (3e-7), or a driver (r157-cc, 0.5*r157-cc)"),
         ("run --accept r157cc", "fix:      Did you mean 'r157-cc'?"),
         ("run --accept -1", "fix:      Correct it; the key means: crashes per test"),
         ("run --exposure lead_brakes=abc", "'abc' is not a valid float"),

@@ -155,8 +155,8 @@ def _checked_lines(root: Node) -> Lines:
         for key, value in inner:
             if not isinstance(key, ScalarNode) or key.tag not in (_TEXT, _TAG + "merge"):
                 shown = key.value[:40] if isinstance(key, ScalarNode) else "made of a list or mapping"
-                found = f"a key {shown}, which is not text"
-                raise ComposerError(None, None, found, key.start_mark, "Quote the key if it is meant as text.")
+                found, quote = f"a key {shown}, which is not text", "Quote the key if it is meant as text."
+                raise ComposerError(None, None, found, key.start_mark, f"{quote} Decimals take a point.")
             place = (*path, key.value)
             if place in lines:
                 found = f"the key {key.value!r} again, first written on line {lines[place]}"

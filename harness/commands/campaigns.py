@@ -120,9 +120,9 @@ def run(
     settings = [*options.of_scenario(scenario), *(f"exposure.{name}={n!r}" for name, n in exposures.items())]
     settings += [] if independent is None else [f"seed={independent}", f"pool.seed={independent}"]
     settings += overrides
-    settings += [] if accept is None else options.accepting(accept)
     settings += [] if executor is None else [f"run.executor={executor}"]
     with error_in(junit, str(campaign_file)):
+        settings += [] if accept is None else options.accepting(accept)
         campaign = harness.load_campaign(campaign_file, settings, av=av)
     if junit is not None and campaign.accept is None:
         say("note: without a limit (--accept) the JUnit file says only whether the run reached its end", err=True)

@@ -157,6 +157,9 @@ def accepting(limit: str) -> list[str]:
             times, driver = driver, times
         if not star:  # 0.5r157-cc can mean nothing else
             times, driver = re.findall(r"^([\d.]*)(.*)$", limit)[0]
+        if not re.match(r"\s*\w", driver):
+            expected = "crashes per test (3e-7), or a driver (r157-cc, 0.5*r157-cc)"
+            raise HarnessError("--accept", limit, expected, "Write one of these.") from None
         keys = ("times_reference", "crash_rate_below")
         value = f"{{driver: {json.dumps(driver.strip())}, at_most: {times.strip() or 1}}}"
     return [f"accept.{keys[0]}={value}", f"accept.{keys[1]}=null"]

@@ -152,6 +152,8 @@ def usage_error(error: click.UsageError, context: click.Context) -> HarnessError
             mend = f"Write --set {setting}=…"
         elif meant := [*longer, *(error.possibilities or ())]:
             mend = f"Did you mean '{meant[0]}'?"
+    elif "extra argument" in found:
+        mend = f"A setting is one word, as in --set stop.rhw=0.1; else see `{context.command_path} --help`."
     return HarnessError(context.command_path, found, f"a call of the form: {usage}", mend)
 
 
@@ -160,8 +162,9 @@ def _setting_of(option: str, command: click.Command) -> str:
     from harness.campaign.campaign import Campaign
     from harness.campaign.models import places_of
 
-    key = option.lstrip("-").replace("-", "_")
-    places = (f"{section}.{key}".lstrip(".") for section in places_of(key, Campaign))
+    *sections, key = option.lstrip("-").replace("-", "_").split(".")
+    places = [f"{section}.{key}".lstrip(".") for section in places_of(key, Campaign)]
+    places = [place for place in places if place.endswith(".".join([*sections, key]))]
     takes_settings = any("--set" in parameter.opts for parameter in command.params)
     return min(places, key=lambda place: place.count("."), default="") if takes_settings else ""
 

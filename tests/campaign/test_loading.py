@@ -31,7 +31,8 @@ def load(tmp_path):
 
 
 MISTAKES = (
-    ("stop: {confidence: 95}", "stop.confidence", 2, "less than or equal to"),
+    ("stop: {confidence: 95}", "stop.confidence", 2, "less than or equal to 0.999999999. Write confidence: 0.95."),
+    ("stop: {rhw: 30 %}", "stop.rhw", 2, "Write 0.3."),
     ("testin:\n  epsilon: 0.2", "testin", 2, "Did you mean 'testing'?"),
     ("av:\n  reaction: {delay: 0.5}", "av.reaction.delay", 3, "Did you mean 'delay_s'?"),  # its unit is left out
     ("epsilon: 0.2", "epsilon", 2, "belongs under testing"),
