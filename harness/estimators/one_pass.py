@@ -18,8 +18,6 @@ from importlib.metadata import entry_points
 from itertools import chain
 from typing import Any, TypeAlias
 
-import numpy as np
-
 from harness.campaign.campaign import Campaign
 from harness.campaign.sections import LEAST_TESTS
 from harness.controllers.find import own_code
@@ -112,8 +110,7 @@ class Diagnostics:
         weights, contact = block.weights(), block.outcome == CONTACT
         self._drawn = block.drawn
         self.n += len(block)
-        counted = {"n_bv_lv_contacts": contact, "n_failed": block.failed}
-        self.counts.update(block.acts(), **{name: int(np.count_nonzero(rows)) for name, rows in counted.items()})
+        self.counts.update(block.acts(), n_bv_lv_contacts=int(contact.sum()), n_failed=int(block.failed.sum()))
         if n_early := block.n_crashes_before_event(self._onset):
             self.counts["n_crashes_before_event"] += n_early
         self._weight += Moments.of(weights)
@@ -162,6 +159,9 @@ def _own(asked: Any, where: str) -> OwnEstimator:
         made = own_code(installed.get(asked, asked), where, wanted)
     if missing := [each for each in ("methods", "add", "result") if not hasattr(made, each)]:
         raise HarnessError(where, f"{name} without {' and '.join(missing)}", wanted, "Add what is missing.")
+    if name in ESTIMATORS:
+        expected = "a name that none of the harness's own has"
+        raise HarnessError(where, f"a class of your own named {name}", expected, "Rename the class.")
     weighted = [each for each in METHODS if each != "shells"]
     methods = made.methods if isinstance(made.methods, list | tuple | set) else ()
     if not methods or not all(each in weighted for each in methods):
@@ -278,9 +278,7 @@ def one_pass(
         if not convergence or n >= convergence[-1].n * SPACING:
             convergence.append(_point(states[own].result(confidence)))
     results = {name: state.result(confidence) for name, state in states.items()}
-    too_few: dict[str, Note] = {
-        name: note("needs_tests", n=n, least=least) for name, least in LEAST_TESTS.items() if n < least
-    }
+    too_few = {name: note("needs_tests", n=n, least=least) for name, least in LEAST_TESTS.items() if n < least}
     if own in too_few:  # a run that was interrupted: others are refused before a test
         expected = f"{LEAST_TESTS[own]:,}: below, its intervals miss too often"
         mend = "Go on with --resume, or let another answer: --resume --set testing.estimator=nade."
@@ -289,11 +287,10 @@ def one_pass(
     if convergence[-1].n != n:
         convergence.append(_point(results[own]))
     estimates = {name: results[name] if why is None else Unavailable(why) for name, why in refusals.items()}
-    result = PassResult(estimates, own, results[own], diagnostics, convergence, None, 0.0, None)
+    passed = estimates, own, results[own], diagnostics, convergence
     if impacts is None:
-        return result
-    severity = impacts.result(confidence)
-    return replace(result, severity=severity, cut_off=impacts.cut_off(), cut_off_test=impacts.cut_off_test)
+        return PassResult(*passed, None, 0.0, None)
+    return PassResult(*passed, impacts.result(confidence), impacts.cut_off(), impacts.cut_off_test)
 
 
 def _point(best: Estimate) -> Point:

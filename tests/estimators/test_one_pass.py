@@ -322,6 +322,12 @@ def test_it_is_ours_with_a_normal_interval_and_is_told_what_tests_are_drawn_by(f
     assert theirs.interval == "normal"
 
 
+def test_one_with_the_name_of_one_of_ours_is_refused():
+    mine = type("nade", (), {"methods": ("forced",), "add": None, "result": None})
+    with pytest.raises(HarnessError, match=r"own named nade; expected .* Rename the class"):
+        asked_for(["nade", mine], "estimators")
+
+
 def test_others_are_the_same_beside_one_that_writes_into_its_blocks(file):
     found = one_pass([block([True, False], [-3.0, -2.0])], [one(file, "Writes"), "nade"]).estimates
     assert found["nade"].crash_rate == pytest.approx(math.exp(-3.0) / 2.0)
