@@ -22,10 +22,10 @@ WORDS = words_of_following(
     unlikely="Cut-outs that ask for little braking of anybody are not among them.",
 )
 CLOSING = Shown(
-    "closing speed of the one that leaves", "m/s", ("Closing", "speed"),
+    "closing speed of LV on SV", "m/s", ("Closing", "speed"),
     lambda tests: tests["closing_mps"], beyond=1.15, cell=1.0,
 )  # fmt: skip
 TTC = Shown(
-    "its time to collision when it has left", "s", ("TTC when", "clear"),
+    "time to collision of both when the lane is clear", "s", ("TTC when", "clear"),
     lambda tests: tests["ttc_when_clear_s"], beyond=1.2, cell=0.25,
 )  # fmt: skip
