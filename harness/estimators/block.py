@@ -37,16 +37,13 @@ MAX_CONTROL_STEPS = 9
 """Control steps that sparse control variates are built from, at most ([paper] section VI-E)."""
 EPISODE_COLUMNS = (
     "episode", "outcome", "event_step", "impact_speed_mps", "n_control_steps", "log_weight", "log_p_event",
-    "n_steps", "end_ttc_s", "took_over_step", "asked_to_speed_up", "braked_before", "fell_behind",
-    "hardest_braking_mps2",
+    "n_steps", "end_ttc_s", "took_over_step", "braked_step", "asked_to_speed_up", "braked_before", "fell_behind",
 )  # fmt: skip
 SHELL_COLUMNS = ("component", "cell", "cell_mass")
 BASELINE_COLUMNS = ("shadow", "event_mass")
 """Of vehicles that act before the event, where `ShellDesign.candidates` says that they are on record."""
-ACTS = "took_over_early", "asked_to_speed_up", "braked_before", "fell_behind", "braked"
+ACTS = "took_over_early", "braked_early", "asked_to_speed_up", "braked_before", "fell_behind", "braked"
 """What AVs do, or ask for in vain, before the event, and whether they brake after its onset; columns of blocks."""
-BRAKED_MPS2 = 1.0
-"""Who never brakes so hard, in many tests, seems not to see the other vehicle [assumed]."""
 DANGER_TTC_S = 2.0
 """A test whose time was up with less to a collision (s), had the AV kept its acceleration, was cut off [assumed].
 
@@ -86,11 +83,11 @@ class Block:
     ``outcome`` (n,) are places in `OUTCOMES`: a failed episode is a row like any other and never a crash.
     ``log_weight`` (n,) is log p(x_c) - log q_sampled(x_c), exactly 0 without control. ``columns``, also as attributes,
     are what else the method records, a row for each episode: bool (n,) ``happened``, ``cut_off`` (`DANGER_TTC_S`),
-    ``took_over_early`` (the AV did something before BV was on its lane), ``asked_to_speed_up`` (or that in vain) and
-    ``braked_before`` (it asked to brake before anything happened), ``fell_behind`` (it did not keep up till then),
-    ``braked`` (`BRAKED_MPS2`); ``impact_mps`` (n,), closing speed at contact, NaN without a crash; ``n_control_steps``
-    (n,). ``log_q`` (n, M) is, per importance function, the sum over control steps of log(q_j/p), -inf where q_j cannot
-    draw the episode;
+    ``took_over_early`` (the AV did something before the event was complete, as BV on its lane), ``asked_to_speed_up``
+    (or that in vain) and ``braked_before`` (it asked to brake before anything happened), ``fell_behind`` (it did not
+    keep up till then), ``braked`` (by `BRAKED_MPS2` after the onset) and ``braked_early`` (so before it was complete);
+    ``impact_mps`` (n,), closing speed at contact, NaN without a crash; ``n_control_steps`` (n,). ``log_q`` (n, M) is,
+    per importance function, the sum over control steps of log(q_j/p), -inf where q_j cannot draw the episode;
     ``martingale`` (n, J) the D_j of `harness.estimators.doubly_robust`;
     ``first_ratios`` (n, 9, J) q_j(a_t|s_t)/q_alpha(a_t|s_t) of the first nine control steps, 1 beyond the last one;
     ``log_p_event`` (n,) log P(event | path), where the path is drawn ahead: it bounds Y of that episode alone. Of
@@ -222,16 +219,19 @@ def block_from_tables(
     failed = outcome == FAILED
     n_control_steps = _integers(episodes, "n_control_steps")
     close = pc.less(episodes["end_ttc_s"], DANGER_TTC_S)
-    early = pc.less_equal(episodes["took_over_step"], episodes["event_step"])
+    early = {
+        f"{did}_early": pc.fill_null(pc.less_equal(episodes[f"{did}_step"], episodes["event_step"]), fill_value=False)
+        for did in ("took_over", "braked")
+    }
     columns: dict[str, Column] = {
         "happened": _known(episodes, "event_step"),
         "n_control_steps": n_control_steps,
         "n_steps": _integers(episodes, "n_steps"),
         "impact_mps": np.asarray(episodes["impact_speed_mps"].to_numpy(), dtype=np.float64),
         "cut_off": (outcome == TIMEOUT) & pc.fill_null(close, fill_value=False).to_numpy(),
-        "took_over_early": pc.fill_null(early, fill_value=False).to_numpy(),
+        **{name: values.to_numpy() for name, values in early.items()},
         **{name: episodes[name].to_numpy() for name in ("asked_to_speed_up", "braked_before", "fell_behind")},
-        "braked": episodes["hardest_braking_mps2"].to_numpy() >= BRAKED_MPS2,
+        "braked": _known(episodes, "braked_step"),
     }
     if sampling.mixes:
         columns["log_q"] = _nested(episodes, "log_q", len(alpha))

@@ -22,7 +22,8 @@ class Words(NamedTuple):
     crash, ``who`` the vehicles are, ``unlikely`` why probabilities of events do not add up to 1. ``shows`` and
     ``happens`` are a vehicle and what it does, at the onset and at the event; equal where these are one. ``tests`` says
     what tests are like, by whether events show themselves, and ``rests`` what a rate scales with, by the traffic (None
-    if it is not known) and the level of lane changing.
+    if it is not known) and the level of lane changing. ``late`` is what one that does not look waits for, and
+    what shows it earlier, to a controller and to a script; empty where nothing does.
     """
 
     called: str
@@ -41,6 +42,7 @@ class Words(NamedTuple):
     unlikely: str
     tests: Callable[[bool], str]
     rests: Callable[[Any, str], str]
+    late: tuple[str, str, str] = ("", "", "")
 
 
 def words_of(*, event: str, of: str, **own: Any) -> Words:

@@ -36,7 +36,7 @@ CELL_DTYPE = np.dtype(
     ]
 )
 
-_STEPS = "n_steps", "event_step", "lead_steps", "onset_step", "took_over_step", "n_control_steps"
+_STEPS = "n_steps", "event_step", "lead_steps", "onset_step", "took_over_step", "braked_step", "n_control_steps"
 _AT_EVENT = "event_gap_m", "event_rate_mps", "onset_gap_m", "onset_rate_mps"
 _AT_END = "crash_time_s", "impact_speed_mps", "min_ttc_s", "end_ttc_s", "hardest_braking_mps2", "av_distance_m"
 _DRAWN = "log_weight", "log_p_event"
@@ -46,9 +46,12 @@ EPISODE_DTYPE = np.dtype(
     + [(name, _f8) for name in (*_AT_EVENT, *_AT_END, *_DRAWN)]
 )
 """Result of a test. ``component`` is the stratum or importance function that it was drawn from, -1 for none;
-``took_over_step`` the first in which the AV did what it asked for, -1 for none; ``asked_to_speed_up`` whether it
-asked to speed up while its speed was held; ``braked_before`` whether it asked to brake at the end of its warm-up;
-``fell_behind`` whether it was more than `FAR_BEHIND_S` behind the vehicle ahead when the event began."""
+``took_over_step`` the first in which the AV did what it asked for, ``braked_step`` that after the onset in which it
+braked by `BRAKED_MPS2`, -1 for none; ``asked_to_speed_up`` whether it asked to speed up while its speed was held;
+``braked_before`` whether it asked to brake at the end of its warm-up; ``fell_behind`` whether it was more than
+`FAR_BEHIND_S` behind the vehicle ahead when the event began."""
+BRAKED_MPS2 = 1.0
+"""Who never brakes so hard, in many tests, seems not to see the other vehicle [assumed]."""
 FAR_BEHIND_S = 5.0
 """Headway beyond which the AV no longer follows the vehicle ahead [assumed]."""
 

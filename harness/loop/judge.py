@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from harness.compiled import compiled, compiled_inline
-from harness.loop.cells import KernelState
+from harness.loop.cells import BRAKED_MPS2, KernelState
 from harness.loop.drive import leader_of
 from harness.loop.repeat import gap_and_rate
 from harness.vehicles.kinematics import CONTACT_M, STEP_S, gap, overlaps
@@ -45,7 +45,10 @@ def judge(kernel: KernelState, contact: BoolArray) -> int:
         test = kernel.episode[cell.row]
         speed_before, cell.av_speed = cell.av_speed, kernel.v[k, av]
         if 0 <= cell.onset_step < cell.step:
-            test.hardest_braking_mps2 = max(test.hardest_braking_mps2, (speed_before - cell.av_speed) / STEP_S)
+            braking = (speed_before - cell.av_speed) / STEP_S
+            test.hardest_braking_mps2 = max(test.hardest_braking_mps2, braking)
+            if braking >= BRAKED_MPS2 and test.braked_step < 0:
+                test.braked_step = cell.step - 1
         if is_ahead(k, kernel):
             gap_m, rate = gap_and_rate(k, kernel)
             if rate < 0.0 and gap_m >= 0.0:

@@ -85,7 +85,8 @@ def begin_cell(k: int, row: int, kernel: KernelState) -> None:
     cell.set_speed = cell.av_speed if math.isnan(set_speed) else set_speed
     cell.announced_index = script.announced_index[row] if script.announced_index[row] >= 0 else episode
     cell.danger = test.min_ttc_s = test.end_ttc_s = math.inf
-    test.took_over_step, test.component = -1, script.stratum[row]
+    test.took_over_step = test.braked_step = -1
+    test.component = script.stratum[row]
     test.log_weight, test.log_p_event = script.log_weight[row], script.log_p_event[row]
     test.event_gap_m = test.event_rate_mps = test.onset_gap_m = test.onset_rate_mps = math.nan
     test.crash_time_s = test.impact_speed_mps = math.nan

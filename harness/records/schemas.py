@@ -82,6 +82,7 @@ def episodes_schema(
             _or_null("event_gap_m", _F8, "m", "R2 then, the gap to the vehicle it is about"),
             _or_null("event_rate_mps", _F8, "m/s", "R2dot then, its rate of change"),
             _or_null("took_over_step", _I2, "0.1 s", "first step in which the AV did what its vehicle asked for"),
+            _or_null("braked_step", _I2, "0.1 s", "first step after the onset in which it braked with 1 m/s² or more"),
             _field("asked_to_speed_up", pa.bool_(), "", "whether it asked to speed up while it was held at its speed"),
             _field("braked_before", pa.bool_(), "", "whether it asked to brake while nothing happened, in its warm-up"),
             _field(

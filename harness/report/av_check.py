@@ -7,10 +7,10 @@ from dataclasses import asdict, dataclass
 from typing import Any, Literal
 
 from harness.errors import EXIT_DONE, EXIT_TOO_MANY_FAILED
-from harness.estimators.block import BRAKED_MPS2
 from harness.estimators.estimate import finite_json
 from harness.estimators.limits import clopper_pearson
-from harness.loop.cells import FAR_BEHIND_S
+from harness.families import family_named
+from harness.loop.cells import BRAKED_MPS2, FAR_BEHIND_S
 from harness.numbers import tests
 from harness.report.words import BRAKES_BEFORE, NEVER_BRAKED, cruise_words, late_words
 from harness.shown import ShownInPython
@@ -58,8 +58,8 @@ class Behaviour:
     """What the AV did in all steps in which it acted, and after the events.
 
     ``reaction_s`` is the median time from the onset of the event to the first braking beyond 0.1 m/s², over the
-    episodes that braked at all; their share is ``braking_share``. ``n_took_over_early`` did something before the
-    overlap, ``n_braked_before`` asked to brake before the onset.
+    episodes that braked at all; their share is ``braking_share``. ``n_took_over_early`` did something before
+    the event was complete (where it follows: braked), ``n_braked_before`` asked to brake before the onset.
     """
 
     mean_acceleration_mps2: float
@@ -108,8 +108,8 @@ class AvCheck(ShownInPython):
     a clock was read; ``limits_mps2`` are the accelerations that count as its limits; ``moved_mps2`` is by how much
     first answers move at most if the warm-up takes so many seconds (key) instead of ``av.warm_up_s``. The built-in IDM
     drives the same episodes. A vehicle that acts before the event meets cut-ins of one step also where those of the
-    campaign take time (``shows``), as a look makes no baseline runs. ``events`` is their name; ``follows`` says how the
-    AV follows from the start.
+    campaign take time (``shows``), as a look makes no baseline runs. ``follows`` says how the AV follows from the
+    start.
     """
 
     source: str
@@ -127,10 +127,15 @@ class AvCheck(ShownInPython):
     idm_behaviour: Behaviour
     speed: Speed
     idm_speed: Speed
-    events: str
+    scenario: str
     follows: Follows | None = None
     idm_follows: Follows | None = None
     script: bool = False
+
+    @property
+    def events(self) -> str:
+        """What its tests are about."""
+        return family_named(self.scenario).words.events
 
     @property
     def exit_code(self) -> int:
@@ -162,8 +167,9 @@ def verdict(check: AvCheck) -> str:
             f" Its constructor takes {speed.construction_s:.1f} s, and each worker of a run calls it "
             f"{speed.constructions} times: what all may share, load once (`load`, see docs/controllers.md)."
         )
-    if check.shows and check.source == "controller" and not behaviour.n_took_over_early:
-        advice += f" But {late_words(script=check.script)}."
+    hides = family_named(check.scenario).words.late[0] and (check.shows or check.follows is not None)
+    if hides and check.source == "controller" and not behaviour.n_took_over_early:
+        advice += f" But {late_words(check.scenario, script=check.script)}."
     shows = int(1.0 / clopper_pearson(0, n, 0.1)[1])  # with 90 % confidence
     rare = "" if check.source == "model" else f" (a fault in fewer than 1 of {shows} tests may not show: --tests)"
     return (

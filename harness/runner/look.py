@@ -79,14 +79,15 @@ def check_av(campaign: Campaign | str | Path, n_episodes: AtLeastTwo = EPISODES)
     differing = tuple(i for i in range(n_episodes) if bits_of(first, i) != again[i])
     cause, clock_read_at = _likely_cause(source, differing[0]) if differing else (None, ())
     family = source.resolved.family
-    early = tested.av.acts_before_event or family.follows
+    early, acted = tested.av.acts_before_event or family.follows, "braked" if family.follows else "took_over"
     return AvCheck(
         source=tested.av.source, engine=tested.world.engine, method=tested.testing.method,
         shows=source.scenario.shows, n_episodes=n_episodes, failures=dict(by_kind(Counter(first.failures.values()))),
         differing=differing, likely_cause=cause, clock_read_at=clock_read_at, limits_mps2=limits,
         moved_mps2={} if family.follows else _moved_by_warm_up(source, min(n_episodes, WARM_UP_EPISODES)),
-        behaviour=_behaviour(first, limits, early=early), idm_behaviour=_behaviour(of_idm, limits, early=early),
-        speed=own_speed, idm_speed=idm_speed, events=family.words.events,
+        behaviour=_behaviour(first, limits, acted, early=early),
+        idm_behaviour=_behaviour(of_idm, limits, acted, early=early),
+        speed=own_speed, idm_speed=idm_speed, scenario=family.name,
         follows=_follows(first) if family.follows else None,
         idm_follows=_follows(of_idm) if family.follows else None, script=script,
     )  # fmt: skip
@@ -224,9 +225,9 @@ def _follows(shard: Shard) -> Follows:
     return Follows(headway, min(gaps, default=math.nan), speed, n_hit)
 
 
-def _behaviour(shard: Shard, limits: tuple[float, float], *, early: bool) -> Behaviour:
-    """What the AV does after the event; ``early``, from the start."""
-    episode, took_over = shard.episode, shard.episode["took_over_step"]
+def _behaviour(shard: Shard, limits: tuple[float, float], did: str, *, early: bool) -> Behaviour:
+    """What the AV does after the event; ``early``, from the start. ``did`` names the step that shows it looks."""
+    episode, took_over = shard.episode, shard.episode[f"{did}_step"]
     acted, reactions = [], []
     for row, trace in sorted(shard.traces.items()):
         event, onset = int(episode["event_step"][row]), int(episode["onset_step"][row])

@@ -10,12 +10,15 @@ import pytest
 
 from examples import idm_traci_style
 from examples.idm import IDM
+from harness.campaign.files import load_campaign
 from harness.families.lead_brakes.words import HEADWAY
+from harness.loop.cells import BRAKED_MPS2
 from harness.sampling import prepare
 from harness.vehicles.kinematics import STEP_S
 from harness.vocabulary import CRASH
 from harness.worlds.twin import TwinWorld
 from tests.families.test_same_bits import LADDERS, require_same, resolved_of, run, source_of
+from tests.in_process import run_here
 
 SET_SPEED_MPS = 40.0
 
@@ -66,7 +69,27 @@ def test_one_that_does_not_keep_up_is_seen_when_the_event_begins(name):
         slower = -np.diff(trace[int(follows.episode["onset_step"][row]) + 1 :, -1, 1]) / STEP_S
         hardest = follows.episode["hardest_braking_mps2"][row]
         assert hardest == pytest.approx(max(slower.max(initial=0.0), 0.0), rel=1e-12)
+        [first, *_] = [*np.flatnonzero(slower >= BRAKED_MPS2) + int(follows.episode["onset_step"][row]) + 1, -1]
+        assert follows.episode["braked_step"][row] == first
     assert follows.episode["hardest_braking_mps2"].max() > 3.0
+
+
+@pytest.mark.parametrize(
+    ("scenario", "av", "told"),
+    [
+        ("cut_out", "av.controller=examples.idm:IDM", "it did nothing before the one ahead (LV) had left the lane; lv"),
+        ("cut_out", "av.model=idm", None),  # looks ahead of it
+        ("cut_out", "av={sumo: {carFollowModel: Krauss}}", "cannot see that LV leaves the lane"),
+        ("lead_brakes", "av.controller=examples.idm:IDM", None),  # nobody could see that coming
+    ],
+)
+def test_one_that_waits_until_the_lane_is_clear_is_told_what_shows_it_earlier(scenario, av, told, tmp_path):
+    """In the same 60 forced events."""
+    engine = "sumo" if "sumo" in av else "twin"
+    asked = [f"scenario={scenario}", "stop={episodes: 60, rhw: null}", "testing.method=forced"]
+    asked.append(f"world.engine={engine}")
+    answer = " ".join(repr(run_here(load_campaign("idm", [*asked, av]), tmp_path / "run")).split())
+    assert told in answer if told else not ("did nothing before" in answer or "cannot see that" in answer)
 
 
 def ahead_on_lane(trace, step, visible):

@@ -85,7 +85,7 @@ def test_what_a_vehicle_of_the_users_own_did_while_bv_came_over_is_warned_of(nam
     counts = dict.fromkeys(("n_asked_to_speed_up", "n_braked_before", "n_braked"), 1234 * (name != "forced-krauss"))
     asked = {**run.estimates.diagnostics, **counts}
     warnings = "".join(said(run, manifest={"events_show": shows}, diagnostics=asked).warnings)
-    assert ("cannot see the other car (BV)" in warnings) == blind
+    assert ("cannot see that BV comes over" in warnings) == blind
     assert ("1,234 tests it asked to speed up" in warnings) == held
     assert ("or set av.before_event=controller" in warnings) == (name != "forced-krauss")
     assert ("1,234 tests it braked with nobody ahead" in warnings) == (name != "forced-krauss")

@@ -17,6 +17,7 @@ WORDS = words_of_following(
     who="LV the one ahead, which leaves the lane, SV the slower one that it reveals",
     shows=("LV", "leaves the lane"),
     happens=("LV", "has left the lane"),
+    late=("the one ahead (LV) had left the lane", "lv_lateral_m > 0", "its getLateralLanePosition > 0"),
     then="leaves the lane and reveals a slower one",
     depend="how slow the vehicle is that is revealed, and how late",
     unlikely="Cut-outs that ask for little braking of anybody are not among them.",
