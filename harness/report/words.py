@@ -168,8 +168,8 @@ def warnings_of(scenario: str, result: Mapping[str, Any], unit: str, but: str = 
         )
     if n := result[EARLY]:
         yield (
-            f"{tests(n)} crashed BEFORE the event, as it just followed: it does so in all driving, which "
-            "this rate leaves out (testing.method=nde counts it)"
+            f"{tests(n)} crashed BEFORE the event, as it just followed: it does so in all driving, of "
+            "which this rate counts only the seconds before events"
         )
     yield from map(note_words, result["cautions"])
     repeated = result["repeated"] or {}

@@ -238,7 +238,8 @@ def take_over(
         "created": earlier.get("created") or datetime.now(UTC).isoformat(timespec="seconds"),
         "seed": campaign.seed, "engine": campaign.world.engine, "versions": versions(), "cpu": cpu_name(),
         "controller_sha256": resolved.controller_sha256, "script": resolved.script,
-        "events_show": family.shows(environment), "distance_per_test_m": family.mean_distance_m(environment), **facts,
+        "events_show": family.shows(environment),
+        "distance_per_test_m": None if campaign.av.acts_before_event else family.mean_distance_m(environment), **facts,
     }  # fmt: skip
     began -= float(earlier.get("wall_time_s") or 0.0)
     parts_before = {name: part for name, part in earlier["before"].items() if (folder / part.files[name].path).exists()}

@@ -219,7 +219,7 @@ def milder_of(resolved: Resolved, table: pa.Table) -> dict[str, Any]:
 
 
 def n_left_out(campaign: Campaign, n_before_event: int) -> int:
-    """Crashes before the event that no rate counts: of a vehicle that follows, which is tested around events alone."""
+    """Crashes before the event, of whose like a rate leaves most out: the AV follows, and is tested around events."""
     follows = family_named(campaign.scenario).follows
     return n_before_event if follows and campaign.testing.method != "nde" else 0
 

@@ -299,6 +299,12 @@ def test_forced_cut_ins_of_a_vehicle_that_holds_are_those_of_one_that_holds(tmp_
     assert one["n_crashes"] > 0
 
 
+def test_nothing_is_said_per_km_where_a_vehicle_that_acts_may_drive_farther_than_one_that_holds(tmp_path):
+    result = run_here(campaign(*FORCED, TWIN, "stop.episodes=100", f"av={of('Speeds')}"), tmp_path / "run")
+    assert result.estimates["distance_per_test_km"] is None
+    assert result.estimates["crash_rate_per_1e6_km"] is None
+
+
 def test_a_forced_test_fails_where_its_shadow_run_did(tmp_path):
     """A row, with the weight of the cut-in that it may have hidden, and counted as a crash in the upper limit."""
     loose = campaign(*FORCED, TWIN, "stop.episodes=200", "run.max_failed_share=0.05", f"av={of('Breaks')}")
