@@ -85,9 +85,9 @@ def _exposures(ctx: click.Context, parameter: click.Parameter, texts: tuple[str,
         family_named(name, where := f"--exposure {text}")
         try:
             per_hour[name] = click.FloatRange(*EXPOSURES)(value, parameter, ctx)
-        except click.BadParameter as error:
+        except click.BadParameter:
             expected = "events per hour of driving, {:g} to {:g}".format(*EXPOSURES)
-            raise HarnessError(where, error.message, expected, f"Write --exposure {name}=0.1, one each.") from None
+            raise HarnessError(where, f"'{value}'", expected, f"Write --exposure {name}=0.1, one each.") from None
     return per_hour
 
 

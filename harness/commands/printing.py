@@ -142,7 +142,8 @@ def system_error(error: OSError | MemoryError) -> HarnessError | None:
 def usage_error(error: click.UsageError, context: click.Context) -> HarnessError:
     """Put what click says of a wrong call into the words of all errors."""
     usage = " ".join(context.get_usage().removeprefix("Usage: ").split())
-    found = error.format_message().rstrip(".")
+    found = error.format_message().rstrip(".").replace("a valid integer range", "a whole number")
+    found = found.replace("a valid float range", "a number")
     mend = f"See `{context.command_path} --help`."
     if isinstance(error, click.NoSuchOption):
         found = f"No such option '{error.option_name}'"

@@ -243,6 +243,13 @@ class PerHour:
         ratios = [mine / theirs for mine, theirs in sums if theirs > 0.0]
         return (min(ratios), max(ratios)) if len(ratios) == len(sums) else None
 
+    def rates_over_assumed(self) -> tuple[float, float] | None:
+        """The least and the largest rate over all ends of what is assumed; None as in `over_assumed`."""
+        if not all(family.rate for family in self.families):
+            return None
+        rates = [[mine for mine, _ in family.over_assumed()] for family in self.families]
+        return math.fsum(map(min, rates)), math.fsum(map(max, rates))
+
     def limits_over_assumed(self, level: Level, *, ratio: bool) -> tuple[float, float]:
         """The outermost limits of the rate, or of `ratio`, over both ends of each assumed exposure."""
         exposures = {family.family: family.exposure for family in self.families}
@@ -274,7 +281,7 @@ class PerHour:
         return {
             "confidence": confidence, "n_episodes": n, "n_crashes": n_crashes, "n_failed": n_failed,
             "per_hour": {"rate": limits.rate, "ci_low": limits.low, "ci_high": limits.high, "upper_bound": bound,
-                         "rhw": limits.rhw},
+                         "rhw": limits.rhw, "over_assumed": self.rates_over_assumed()},
             "counts_in_interval": counts, "mean_speed_mps": speed_mps, "per_1e6_km": limits.rate * per_km,
             "beside": beside, "readings": readings,
             "families": dict(self._families(confidence)),

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from functools import cache
 from pathlib import Path
 from types import MappingProxyType
-from typing import Annotated, Any, ClassVar, Literal, NamedTuple, Self
+from typing import Annotated, Any, ClassVar, Literal, NamedTuple, Self, get_args
 
 from pydantic import AfterValidator, BaseModel, Field, model_validator
 
@@ -149,7 +149,13 @@ class ParameterFile(Section):
     @model_validator(mode="before")
     @classmethod
     def _is_like_another(cls, content: Any) -> Any:
-        return completed(content, cls.folder) if isinstance(content, dict) else content
+        if not isinstance(content, dict):
+            return content
+        own = get_args(cls.model_fields["format"].annotation)
+        if (found := content.get("format", own[0])) not in own:
+            mend = "Name the file of this scenario: `harness fit` writes one for each."
+            raise broken_rule("format", describe_found(found), own[0], mend)
+        return completed(content, cls.folder)
 
     @property
     def kinds(self) -> Any:
@@ -206,7 +212,7 @@ def completed(content: dict[str, Any], folder: Path) -> dict[str, Any]:
     shipped = sorted(file.stem for file in folder.glob("*.yaml"))
     if content["like"] not in shipped:
         found, expected = describe_found(content["like"]), f"one of {', '.join(shipped)}"
-        raise broken_rule("like", found, expected, "Name one, or write all numbers.")
+        raise broken_rule("like", found, expected, "Name one, or the file of this scenario.")
     merged = dict(_shipped(folder / f"{content['like']}.yaml"))
     for key, part in content.items():
         both_sections = isinstance(part, dict) and isinstance(merged.get(key), dict)

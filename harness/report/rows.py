@@ -95,12 +95,12 @@ def _rate_row(what: str, of_km: str, estimates: Estimates, unseen: AssumedOfRate
     return Row("rate", what, f"{sign}{number(shown)} per test", ends, remark)
 
 
-def looking_words(assumed: AssumedOfRate, of: str = "") -> str:
-    """In which other traffic a rate moves most, told ``of`` some drivers; empty where no range is stated of them."""
+def looking_words(assumed: AssumedOfRate) -> str:
+    """In which other traffic a rate moves most; empty where no range is stated of its drivers."""
     if assumed.highest is None or assumed.times is None:
         return ""
     here = "" if assumed.share is None else f", not {plain(100.0 * assumed.share)} %,"
-    return f"{plain(100.0 * assumed.highest)} %{here}{of} do not look behind"
+    return f"{plain(100.0 * assumed.highest)} %{here} do not look behind"
 
 
 def width_row(campaign: Campaign, best: Estimate, expected: Mapping[str, int] | None) -> Iterator[Row]:

@@ -170,10 +170,13 @@ def exposures(content: Mapping[str, Any]) -> str:
         if EXCLUDED in exposure["source"]:
             phrases[kind][-1] += f" ({EXCLUDED})"
         assumed = family["n_crashes"] and family.get("assumed")
-        if assumed and (others := looking_words(moved := AssumedOfRate(**assumed), " of these")):
-            phrases[kind][-1] += f" (crashes × {number(moved.most, 2)} if {others})"
+        if assumed and (others := looking_words(moved := AssumedOfRate(**assumed))):
+            phrases[kind][-1] += f" (crashes up to × {number(moved.most, 2)} if {others})"
     parts = [f"{kind}: {', '.join(scenarios)}" for kind, scenarios in phrases.items()]
-    return "events per hour of driving, " + "; ".join([*parts, "other numbers: harness sensitivity"])
+    more = "other numbers: harness sensitivity"
+    if (ends := content["per_hour"]["over_assumed"]) is not None and ends[0] < ends[1]:
+        more = f"rate over assumed ranges {' to '.join(number(end, 2) for end in ends)}"
+    return f"events per hour, {'; '.join([*parts, more])}"
 
 
 def between(low: float, high: float | None, rate: float) -> str:

@@ -273,13 +273,15 @@ def _scope(campaign: Campaign, manifest: Mapping[str, Any], estimates: Estimates
         within = campaign.testing.shells.statement != ASSUMPTION_FREE and best.details.get("within")
         rhw = end(within["rhw"]) if within else best.precision
         width = share(rhw) if share(rhw) != share(target) else f"{number(100.0 * rhw)} %"  # where they differ
-        reached = reached_words(rhw, width)
+        reached, asked = reached_words(rhw, width), f"± {share(target)}"
+        few = next((each.numbers["least"] for each in estimates.unmet if each.key == "min_crashes"), 0)
+        asked += f" of {few} crashes" * (rhw <= target and few > 0)
         if not best.n_crashes or best.cautions:
             reached = ", precision not known" if best.n_crashes else ", no crash seen"
         further = go_on(best.n_episodes, further=(rhw / target) ** 2 if best.n_crashes else math.inf)
         more = further if stopped_by == "episodes" else remedy_words(manifest.get("remedy"))
         more = "" if manifest.get("expected") and best.n_crashes else more  # `width_row` has it
-        ended += f"{reached} (asked: ± {share(target)}){more}"
+        ended += f"{reached} (asked: {asked}){more}"
     elif stopped_by == "episodes":
         decision = estimates.decision
         ended = "all tests done" if decision is None else ended + go_on(best.n_episodes, best.n_crashes, decision)
@@ -337,11 +339,11 @@ def elsewhere_words(elsewhere: Elsewhere) -> str:
     return f"tested in {elsewhere.tested_in}, answered for {elsewhere.answered_for}: {rests}"
 
 
-# -- for a terminal: some nine lines of 100 columns --
+# -- for a terminal: some ten lines of 100 columns --
 
 MOST_FURTHER = 10.0
 """Times the tests done that are told as those to go on with, at most [assumed]."""
-WIDTH, LINES, LABEL = 100, 9, 26
+WIDTH, LINES, LABEL = 100, 10, 26
 MOST_WARNINGS = 3
 
 

@@ -240,3 +240,16 @@ def test_aliases_that_multiply_are_refused_at_once(read, first, more, levels):
 def test_traffic_of_another_scenario_is_told_which_to_write():
     with pytest.raises(CampaignError, match=r"of cut_in; expected traffic of lead_brakes.*parameters=lead-brakes-1"):
         load_campaign(FOLDER / "smoke.yaml", ["scenario=lead_brakes"])
+
+
+@pytest.mark.parametrize(
+    ("scenario", "content"), [("lead_brakes", "format: ndd-overtaking"), ("cut_in", "like: cut-out-1")]
+)
+def test_a_file_of_traffic_of_another_scenario_is_one_mistake(scenario, content, tmp_path):
+    (tmp_path / "mine.yaml").write_text(
+        f"{content}\nversion: 1\ninitial_state: {{r1dot_df: {{value: 3, source: x}}}}\n"
+    )
+    asked = [f"scenario={scenario}", f"environment.parameters={tmp_path}/mine.yaml"]
+    with pytest.raises(CampaignError, match="the file of this scenario") as caught:
+        resolve(load_campaign("idm", asked))
+    assert caught.value.problems == ()

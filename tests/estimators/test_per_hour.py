@@ -156,6 +156,7 @@ def test_who_does_not_look_moves_the_ratio_of_the_sum_while_events_per_hour_stay
             for x in (1.0, by) for y in (0.2, 5.0)]  # fmt: skip
     ratios = [mine / theirs for mine, theirs in both]
     assert PerHour([cut_in, THREE[1]]).over_assumed() == pytest.approx((min(ratios), max(ratios)))
+    assert PerHour([cut_in, THREE[1]]).rates_over_assumed() == pytest.approx((both[0][0], both[-1][0]))
     # On one event in ten of a shell a vehicle may crash on those of drivers who do not look alone.
     tests, crashes = cut_in.tally.tests, cut_in.tally.crashes
     few = family("cut_in", cut_in.seen.design.p, tests, np.minimum(crashes, tests // 10), cut_in.exposure, CC)

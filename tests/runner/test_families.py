@@ -240,7 +240,7 @@ def test_what_other_traffic_does_to_a_scenario_is_said_once(run):
     """As in the answer of that scenario alone, but at as many events: there are 1.31 times as many per test, too."""
     content = run.content
     told = " ".join(" ".join(hour_lines(content)).split())
-    said = "cut-in 0.048 (crashes × 19 if 25 %, not 1 %, of these do not look behind); assumed: lead brakes 0.1"
+    said = "cut-in 0.048 (crashes up to × 19 if 25 %, not 1 %, do not look behind); assumed: lead brakes 0.1"
     assert told.count(said) == 1
     assert "25 %, not 1 %, do not look behind" in repr(run.runs["cut_in"])
     assert (run.folder / "report.html").read_text().count("× 19 if 25 %, not 1 %") == 1
@@ -353,7 +353,7 @@ def test_a_reading_of_the_regulation_that_turns_the_answer_is_said(run):
     without["families"] = {name: {**of, "n_crashes": 0} for name, of in run.content["families"].items()}
     told = " ".join(" ".join(hour_lines(without)).split())
     assert said.replace("0.53 (0.46 to 1.21)", "< 1.02") in told
-    assert ("(crashes × " in " ".join(hour_lines(run.content)), "(crashes × " in told) == (True, False)
+    assert ("(crashes up to × " in " ".join(hour_lines(run.content)), "(crashes up to × " in told) == (True, False)
 
 
 def test_what_the_vehicle_did_before_bv_came_is_said_as_in_the_answer_of_one_scenario(run):
@@ -410,7 +410,7 @@ def test_each_scenario_may_have_a_file_of_its_own(tmp_path):
     one = campaign("scenarios=[lead_brakes]", f"environments={{lead_brakes: {tmp_path / 'mine.yaml'}}}")
     told = hour_lines(run_here(one, tmp_path / "run").content)
     assert " in SUMO’s twin, 1 scenario · " in told[0]
-    assert "  events per hour of driving, given: lead brakes 0.3; other numbers: harness" in "\n".join(told)
+    assert "  events per hour, given: lead brakes 0.3; other numbers: harness" in "\n".join(told)
     (tmp_path / "mine.yaml").write_text("like: lead-brakes-1\nexposure: {per_hour: {value: 0.5, source: user}}\n")
     folder = tmp_path / "run"
     for again, of in ((estimate_families, folder), (other_traffic.sensitivity, folder / "lead_brakes")):
