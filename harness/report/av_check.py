@@ -12,7 +12,7 @@ from harness.estimators.limits import clopper_pearson
 from harness.families import family_named
 from harness.loop.cells import BRAKED_MPS2, FAR_BEHIND_S
 from harness.numbers import tests
-from harness.report.words import BRAKES_BEFORE, NEVER_BRAKED, cruise_words, late_words
+from harness.report.acted import BRAKES_BEFORE, NEVER_BRAKED, cruise_words, late_words
 from harness.shown import ShownInPython
 
 SLOW_S = 0.1

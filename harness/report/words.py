@@ -16,11 +16,10 @@ from pydantic import BaseModel
 
 from harness.campaign.campaign import Campaign
 from harness.campaign.vehicle import AutomatedVehicle
-from harness.estimators.answer import MANY, STORED_ESTIMATES, Elsewhere, Estimates, before_event
+from harness.estimators.answer import STORED_ESTIMATES, Elsewhere, Estimates, before_event
 from harness.estimators.limits import clopper_pearson
 from harness.estimators.severity import TOUCH_MPS
 from harness.families import family_named
-from harness.loop.cells import BRAKED_MPS2, FAR_BEHIND_S
 from harness.numbers import (
     WIDEST_RHW,
     count,
@@ -34,6 +33,7 @@ from harness.numbers import (
     two_digits_up,
     words,
 )
+from harness.report.acted import acted_words
 from harness.report.notes import note_words
 from harness.report.rows import Row, end, held_back, ratio_warning, rows_of, too_few, with_traffic
 from harness.sampling.paths import n_left_out
@@ -194,7 +194,7 @@ def warnings_of(scenario: str, result: Mapping[str, Any], unit: str, but: str = 
     if touches is not None and touches > 0.5:
         left_out = f"crash.counts_above_mps={plain(TOUCH_MPS)} leaves them out"
         yield f"{share(touches)} of these crashes are touches below {plain(TOUCH_MPS)} m/s: {left_out}"
-    yield from _acts(scenario, result.get("before_event"))
+    yield from acted_words(scenario, result.get("before_event"))
 
 
 def _warnings(campaign: Campaign, manifest: Mapping[str, Any], estimates: Estimates) -> Iterator[str]:
@@ -221,47 +221,6 @@ def runs_warning(decision: Mapping[str, Any] | None) -> Iterator[str]:
     if decision is not None and (n := decision.get("n_runs")):
         more = f"raise pool.shadow_paths to {count(n)}, with a new --out"
         yield f"its baseline runs may miss what it does in one of many drives, which may be above the limit: {more}"
-
-
-NEVER_BRAKED = f"it never braked with {plain(BRAKED_MPS2)} m/s² or more (below 0): does it see the other vehicle?"
-BRAKES_BEFORE = "in {} it braked with nobody ahead, which makes the event milder"
-
-
-def late_words(scenario: str, *, script: bool) -> str:
-    """That a vehicle does nothing before an event is complete, as BV in its lane, and what would show it."""
-    what, seen, seen_by_script = family_named(scenario).words.late
-    return f"it did nothing before {what}; {seen_by_script if script else seen} shows it earlier"
-
-
-def cruise_words(did: Sequence[str], *, script: bool) -> str:
-    """What a vehicle did before anything happened, as one does whose own set speed is not that of the test."""
-    speed = "getAllowedSpeed" if script else "set_speed_mps"
-    return f"{'; '.join(did)}: let it cruise at {speed}, or set av.before_event=controller"
-
-
-def _acts(scenario: str, before: Mapping[str, Any] | None) -> Iterator[str]:
-    """What the vehicle did before the event, or did not after it (`before_event`), a line each."""
-    if before is None:
-        return
-    if before["n_events"] and not before["n_braked"] and not before["built_in"]:
-        yield NEVER_BRAKED
-    if (n := before["n_fell_behind"]) > MANY * before["n_events"] and not before["built_in"]:
-        why = "which makes the event milder: let it keep up"
-        yield f"in {tests(n)} it was over {FAR_BEHIND_S:g} s behind the vehicle ahead when the event began, {why}"
-    follows, shown = family_named(scenario).follows, family_named(scenario).words
-    if shown.late[0] and (before["waits"] or follows):
-        if before["source"] in ("sumo", "traci"):
-            sees = " ".join(shown.shows)
-            yield f"SUMO changes lanes in one step: this vehicle cannot see that {sees}, as drivers can"
-        elif before["n_events"] and not before["n_braked_early" if follows else "n_took_over_early"]:
-            yield late_words(scenario, script=before["script"])
-    if not before["waits"]:
-        return
-    did = [BRAKES_BEFORE.format(tests(n))] if (n := before["n_braked_before"]) else []
-    if (n := before["n_asked_to_speed_up"]) and not before["built_in"]:  # our own models do, which is known
-        did.append(f"in {tests(n)} it asked to speed up before BV was in its lane, and its speed was held")
-    if did:
-        yield cruise_words(did, script=before["script"])
 
 
 def _scope(campaign: Campaign, manifest: Mapping[str, Any], estimates: Estimates) -> str:

@@ -1,0 +1,51 @@
+"""What a vehicle did before its events, or did not, in words: of answers, and of `harness.report.av_check`."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+from harness.estimators.answer import MANY
+from harness.families import family_named
+from harness.loop.cells import BRAKED_MPS2, FAR_BEHIND_S
+from harness.numbers import plain, tests
+
+NEVER_BRAKED = f"it never braked with {plain(BRAKED_MPS2)} m/s² or more (below 0): does it see the other vehicle?"
+BRAKES_BEFORE = "in {} it braked with nobody ahead, which makes the event milder"
+
+
+def late_words(scenario: str, *, script: bool) -> str:
+    """That a vehicle does nothing before an event is complete, as BV in its lane, and what would show it."""
+    what, seen, seen_by_script = family_named(scenario).words.late
+    return f"it did nothing before {what}; {seen_by_script if script else seen} shows it earlier"
+
+
+def cruise_words(did: Sequence[str], *, script: bool) -> str:
+    """What a vehicle did before anything happened, as one does whose own set speed is not that of the test."""
+    speed = "getAllowedSpeed" if script else "set_speed_mps"
+    return f"{'; '.join(did)}: let it cruise at {speed}, or set av.before_event=controller"
+
+
+def acted_words(scenario: str, before: Mapping[str, Any] | None) -> Iterator[str]:
+    """What the vehicle did before the event, or did not after it (`before_event`), a line each."""
+    if before is None:
+        return
+    if before["n_events"] and not before["n_braked"] and not before["built_in"]:
+        yield NEVER_BRAKED
+    if (n := before["n_fell_behind"]) > MANY * before["n_events"] and not before["built_in"]:
+        why = "which makes the event milder: let it keep up"
+        yield f"in {tests(n)} it was over {FAR_BEHIND_S:g} s behind the vehicle ahead when the event began, {why}"
+    follows, shown = family_named(scenario).follows, family_named(scenario).words
+    if shown.late[0] and (before["waits"] or follows):
+        if before["source"] in ("sumo", "traci"):
+            sees = " ".join(shown.shows)
+            yield f"SUMO changes lanes in one step: this vehicle cannot see that {sees}, as drivers can"
+        elif before["n_events"] and not before["n_braked_early" if follows else "n_took_over_early"]:
+            yield late_words(scenario, script=before["script"])
+    if not before["waits"]:
+        return
+    did = [BRAKES_BEFORE.format(tests(n))] if (n := before["n_braked_before"]) else []
+    if (n := before["n_asked_to_speed_up"]) and not before["built_in"]:  # our own models do, which is known
+        did.append(f"in {tests(n)} it asked to speed up before BV was in its lane, and its speed was held")
+    if did:
+        yield cruise_words(did, script=before["script"])
