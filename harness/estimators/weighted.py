@@ -166,7 +166,7 @@ class Nade:
         if origin == "tests" and not self.is_settled():
             notes.append(note("bound_rests", cap=origin))
         if 0.0 < half_width < cap / self.n <= OVERTURNS * self.y.mean(self.n):  # beyond that there is a caution
-            notes.append(note("one_more_moves", cap=cap, by=cap / self.n))
+            notes.append(note("one_more_moves", by=cap / self.n))
         return notes
 
     def result(self, confidence: float) -> Estimate:

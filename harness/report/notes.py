@@ -60,8 +60,8 @@ NOTES = {
     "few_effective": "effective sample size {n:.3g} is below {least:g}: few weights carry the estimate",
     "one_carries": "one crash carries {share:.0%} of the estimate",
     "bound_rests": "the upper bound rests on {cap:cap}, not on a cap guaranteed by design",
-    "one_more_moves": "one more crash of the largest weight that the design allows ({cap:.3g}) would move the estimate "
-    "by {by:.3g}, farther than the interval reaches: only more tests can rule that out",
+    "one_more_moves": "one more crash of the largest possible weight would raise the rate by {by:number}, farther than "
+    "the interval reaches: only more tests can rule that out",
     "plain_width": "fewer than {least:.0f} effective crashes: the interval is as wide as that of the plain mean of "
     "weighted crashes",
     "due_not_drawn": "on some paths surrogates predict crashes of large weight that were not drawn: tests vary "

@@ -205,6 +205,7 @@ def _warnings(campaign: Campaign, manifest: Mapping[str, Any], estimates: Estima
     yield from warnings_of(campaign.scenario, result | doubts_of(campaign, manifest, estimates), " per test", but)
     if assumed is not None and assumed.where and assumed.times is None:
         yield unseen_words(assumed.where)
+    yield from (note_words(each) for each in best.warnings if each.key == "one_more_moves")
     yield from runs_warning(estimates.decision)
     yield from ratio_warning(estimates)
     on_rate = estimates.decision is not None and not estimates.decision.get("driver")
