@@ -238,6 +238,12 @@ def _of_sum(folder: Path, ranges: Ranges, progress: Progress) -> Sensitivity:
             own = _of_one(folder / name, own_ranges[name], progress, per_event=True)
         except CampaignError as refused:
             not_moved.append(NotMoved(name, shares[0], str(refused.found), str(refused.expected)))
+            if (stated := part.get("assumed")) and stated["highest"]:  # the run has told by how much at most
+                what, not_told = (
+                    f"{name} drivers who do not look, up to {100.0 * stated['highest']:g} %",
+                    (math.nan,) * 2,
+                )
+                bars.append(_part(Bar(what, "assumed", None, tuple(stated["times"]), not_told, not_told), *shares))
         else:
             for bar in own.bars:
                 what = bar.what if bar.what.startswith(f"{name}.") else f"{name} {bar.what}"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import re
 
 import pytest
@@ -281,6 +282,13 @@ def test_what_moves_one_scenario_moves_the_sum_by_its_share(run, tmp_path, monke
     )
     bars = {bar["what"]: bar for bar in json.loads((folder / "sensitivity.json").read_text())["bars"]}
     assert len(bars) == 3 + 2
+    stored["families"]["cut_out"] |= {"assumed": told["families"]["cut_in"]["assumed"], "share": 0.5}
+    least, most = told["families"]["cut_in"]["assumed"]["times"]
+    asked = {"braking.stop_share": (0.0, 0.1)}
+    (of,) = [bar for bar in other_traffic._of_sum(folder, asked, Progress()).bars if bar.what.endswith("up to 25 %")]
+    assert of.what == "cut_out drivers who do not look, up to 25 %"
+    assert of.rate == pytest.approx((0.5 + 0.5 * least, 0.5 + 0.5 * most))
+    assert all(map(math.isnan, of.ratio))
     for name, of in told["families"].items():
         rate, driver = told["per_hour"]["rate"], told["beside"]["rate_per_hour"]
         low, high = (estimate_families(folder, {name: of["exposure"][end]}) for end in ("low", "high"))
