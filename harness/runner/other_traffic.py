@@ -239,10 +239,8 @@ def _of_sum(folder: Path, ranges: Ranges, progress: Progress) -> Sensitivity:
         except CampaignError as refused:
             not_moved.append(NotMoved(name, shares[0], str(refused.found), str(refused.expected)))
             if (stated := part.get("assumed")) and stated["highest"]:  # the run has told by how much at most
-                what, not_told = (
-                    f"{name} drivers who do not look, up to {100.0 * stated['highest']:g} %",
-                    (math.nan,) * 2,
-                )
+                what = f"{name} drivers who do not look, up to {100.0 * stated['highest']:g} %"
+                not_told = (math.nan, math.nan)
                 bars.append(_part(Bar(what, "assumed", None, tuple(stated["times"]), not_told, not_told), *shares))
         else:
             for bar in own.bars:
