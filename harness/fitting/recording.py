@@ -38,8 +38,9 @@ ANOTHER_VEHICLE_S = 60.0
 OFF_IN_STEP_M = 3.0
 OFF_IN_SECOND_M = 5.0
 """More than measurement error between the way of a frame, or of a second, and that of the speeds [assumed]."""
-JUMP_MPS, HARDEST_MPS2 = 5.0, 10.0
-"""A speed may change from row to row by measurement error and at this acceleration [assumed]."""
+JUMP_MPS = 5.0
+JUMPS = {"speed_mps": (JUMP_MPS, 10.0), "lateral_m": (5.0, 5.0), "length_m": (3.0, 0.0)}
+"""By how much a vehicle's number may change from row to row by measurement error, and per second of motion [assumed]."""
 
 
 class ColumnRule(NamedTuple):
@@ -252,8 +253,9 @@ def _check_motion(recording: Recording, rows: pd.DataFrame) -> None:
         raise TrajectoryError(recording.place, found, f"at most {MOST_APART_M:g} m", mend)
     step = np.flatnonzero(np.diff(vehicle) == 0)
     dt = (frame[step + 1] - frame[step]) / rate
-    off = np.abs(np.diff(v))[step] > JUMP_MPS + HARDEST_MPS2 * dt
-    _require_agreement(recording, step[off], 1, "speed_mps", v)
+    for name, (most, per_s) in JUMPS.items():
+        off = np.abs(np.diff(rows[name]))[step] > most + per_s * dt
+        _require_agreement(recording, step[off], 1, name, rows[name].to_numpy())
     off = np.abs(np.diff(s) - np.diff(driven_m) / ratio)[step] > OFF_IN_STEP_M + JUMP_MPS * dt
     _require_agreement(recording, step[off], 1, "s_m", s, driven_m / ratio)
     off = np.abs(way_m - of_speeds_m / ratio) > OFF_IN_SECOND_M
@@ -275,10 +277,8 @@ def _require_agreement(
     first, last = int(off[0]), int(off[0]) + frames
     a, b = column[[first, last]]
     found = f"{name} {a:.6g}, and {b:.6g} in row {recording.row[last]}"
-    if driven_m is not None:
-        found += f", where speeds say {a + driven_m[last] - driven_m[first]:.6g}"
-    if off.size > 1:
-        found += f"; {off.size:,} such pairs of rows"
+    found += "" if driven_m is None else f", where speeds say {a + driven_m[last] - driven_m[first]:.6g}"
+    found += f"; {off.size:,} such pairs of rows" * (off.size > 1)
     mend = f"{CORRECT} If they are many, positions or speeds stand still, or are of different vehicles."
     raise TrajectoryError(recording.where(first), found, "positions and speeds of one motion in all rows", mend)
 

@@ -220,7 +220,7 @@ def hardest_crash(folder: Path) -> tuple[Path, int]:
     Raises `RunFolderError`: there is no crash.
     """
     several, crashes = (folder / FAMILIES).is_file(), list[tuple[float, int, Path]]()
-    runs = [manifest.parent for manifest in sorted(folder.glob("*/manifest.json"))] if several else [folder]
+    runs = [manifest.parent for manifest in sorted(folder.glob("*/manifest.json")) if several] or [folder]
     for run in runs:
         if not (parts := records.read_manifest(run)["parts"]):
             raise records.no_episodes(run)

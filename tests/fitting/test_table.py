@@ -275,7 +275,7 @@ def test_a_recording_is_named_and_left_out(tmp_path):
             judged(tmp_path / "all.csv", leave_out=left_out)
 
 
-@pytest.mark.parametrize("column", ["s_m", "speed_mps"])
+@pytest.mark.parametrize("column", ["s_m", "speed_mps", "lateral_m", "length_m"])
 @pytest.mark.parametrize("row", range(1001, 1004))
 def test_one_wrong_value_is_refused_whatever_its_row(column, row, tmp_path):
     file = tmp_path / "rows.parquet"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import re
+import shutil
 
 import pytest
 
@@ -235,6 +236,12 @@ def test_the_hardest_crash_of_all_scenarios_is_replayed(run, capsys):
     assert main(["replay", str(run.folder), "--stored"]) == 0
     assert capsys.readouterr().out.startswith(f"{run.folder / hardest}, test {number_of}: crash; ")
     assert harness.replay(run.folder, stored=True).row["episode"] == number_of
+
+
+def test_a_sum_whose_runs_are_gone_has_nothing_to_replay(run, tmp_path, capsys):
+    shutil.copy(run.folder / "families.json", tmp_path)
+    assert main(["replay", str(tmp_path), "--stored"]) == 2
+    assert f"error: {tmp_path / 'manifest.json'}" in capsys.readouterr().err
 
 
 def test_what_other_traffic_does_to_a_scenario_is_said_once(run):
