@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import json
 import os
+import shutil
 import sys
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -129,6 +130,9 @@ def system_error(error: OSError | MemoryError) -> HarnessError | None:
     if isinstance(error, MemoryError):
         mend = f"Use fewer --workers, or lift the limit (`ulimit -v`, or one that the vehicle has set). {_AGAIN}"
         return HarnessError("memory", "none left", "room for the tests of each worker", mend)
+    if isinstance(error, shutil.Error):  # all files of a folder that cannot be copied, and why
+        (where, _, why), mend = error.args[0][0], "Restore it, or change its permissions."
+        return HarnessError(str(where), why.partition("] ")[2], "a file that can be copied", mend)
     name = errno.errorcode.get(error.errno or 0)
     where = str(error.filename or "disk of the output folder")
     if name == "ENOENT" and error.filename is None:  # raised by os.getcwd

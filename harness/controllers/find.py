@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import importlib
 import math
 import os
@@ -12,6 +11,7 @@ from collections.abc import Callable, Iterable
 from contextlib import suppress
 from copy import deepcopy
 from functools import cache, partial
+from hashlib import sha256
 from importlib.util import module_from_spec, spec_from_file_location
 from inspect import Parameter, Signature, isfunction, signature
 from operator import methodcaller
@@ -93,7 +93,7 @@ def source_of_own(name: str, where: str) -> str:
 
 def _of_file(file: Path) -> ModuleType:
     """The module that a file makes; its name is not that of another file, or of an installed module, of this name."""
-    name = f"{file.stem}_{hashlib.sha256(bytes(real_path(file))).hexdigest()[:8]}"
+    name = f"{file.stem}_{sha256(bytes(real_path(file))).hexdigest()[:8]}"
     with _RUNNING:
         if name not in sys.modules:
             loader = FromSource(name, str(file))
@@ -346,10 +346,10 @@ def _sources_of_made(av: AutomatedVehicle) -> str | None:
 
 def _hash_of_all(files: Iterable[str]) -> str | None:
     contents = sorted(filter(None, map(_hash_of, files)))
-    return hashlib.sha256("".join(contents).encode()).hexdigest() if contents else None
+    return sha256("".join(contents).encode()).hexdigest() if contents else None
 
 
 def _hash_of(file: str) -> str | None:
     """SHA-256 of a file; None if there is none: a parameter may be no path, or one too long, or with a zero in it."""
     is_file = os.path.isfile(file)  # noqa: PTH113 - to pathlib a name too long is an error
-    return hashlib.sha256(Path(file).read_bytes()).hexdigest() if is_file else None
+    return sha256(Path(file).read_bytes()).hexdigest() if is_file else None

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 WATCHED = (
-    *("builtins", "functools", "io", "math", "json", "os", "pickle", "signal", "struct", "time"),
+    *("builtins", "functools", "hashlib", "io", "math", "json", "os", "pickle", "signal", "struct", "time", "zlib"),
     *("numpy", "pyarrow", "pyarrow.compute", "pyarrow.parquet"),
 )
 OURS = "harness", "numba", "llvmlite", "numpy"

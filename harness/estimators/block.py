@@ -296,7 +296,7 @@ def _nested(table: pa.Table, name: str, width: int) -> FloatArray:
     values = np.asarray(column.flatten().to_numpy(zero_copy_only=False), dtype=np.float64)
     if len(values) != table.num_rows * width:
         expected = f"{width} in each row, by importance function or surrogate of the campaign"
-        mend = "The records belong to another campaign or are damaged. " + MEND_PART
+        mend = "Restore shells.json and campaign.yaml as the run has written them: they, or the tables, are of another."
         raise RunFolderError(f"column {name}", f"{len(values)} numbers in {table.num_rows} rows", expected, mend)
     return values.reshape(table.num_rows, width)
 

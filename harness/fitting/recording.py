@@ -40,7 +40,7 @@ OFF_IN_SECOND_M = 5.0
 """More than measurement error between the way of a frame, or of a second, and that of the speeds [assumed]."""
 JUMP_MPS = 5.0
 JUMPS = {"speed_mps": (JUMP_MPS, 10.0), "lateral_m": (5.0, 5.0), "length_m": (3.0, 0.0)}
-"""By how much a vehicle's number may change from row to row by measurement error, and per second of motion [assumed]."""
+"""How far numbers of a vehicle may change from row to row by measurement error, and per second by motion [assumed]."""
 
 
 class ColumnRule(NamedTuple):

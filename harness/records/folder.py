@@ -291,8 +291,8 @@ def read_manifest(folder: Path, *, mend: str = NO_RUN) -> dict[str, Any]:
     return {**manifest.model_dump(exclude_unset=True), "parts": manifest.parts, "before": manifest.before}
 
 
-def read_as(kind: type[T], path: Path, *, mend: str) -> T:
-    """Read a JSON file of a run as a type; a file that no run has written is refused, naming its first wrong value."""
+def read_as(kind: type[T], path: Path, *, mend: str, key: str = "") -> T:
+    """Read a JSON file of a run as a type, with a key; what no run has written is refused by its first wrong value."""
     expected = "a JSON file of a run"
     try:
         content = path.read_bytes()
@@ -307,6 +307,8 @@ def read_as(kind: type[T], path: Path, *, mend: str) -> T:
         found = f"no key {where}" if first["type"] == "missing" else f"{where} {shortened(repr(first['input']), 60)}"
         wrong = f"what a run has written: {first['msg'][:1].lower()}{first['msg'][1:]}"
         raise RunFolderError(str(path), found + more, wrong, mend) from None
+    if key and key not in values:
+        raise RunFolderError(str(path), f"no key {key}", "what a run has written", mend)
     if (seal := values.pop(SEAL, "none")) != _seal(values):
         raise RunFolderError(str(path), f"values that do not fit their checksum ({SEAL}: {seal})", expected, mend)
     return value

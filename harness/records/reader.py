@@ -226,9 +226,8 @@ def hardest_crash(folder: Path) -> tuple[Path, int]:
             raise records.no_episodes(run)
         for part in parts:
             # Tests without a crash have no impact speed.
-            columns = records.read_kept(run, part, "episodes", ["impact_speed_mps", "episode"]).drop_null()
-            speeds_mps, episodes = (column.to_pylist() for column in columns.itercolumns())
-            crashes += [(-speed_mps, episode, run) for speed_mps, episode in zip(speeds_mps, episodes, strict=True)]
+            tests = records.read_kept(run, part, "episodes", ["impact_speed_mps", "episode"]).drop_null().to_pylist()
+            crashes += [(-test["impact_speed_mps"], test["episode"], run) for test in tests]
     if not crashes:
         expected, mend = "the number of a test to replay", f"Name one: harness replay {run} 0."
         raise RunFolderError(str(folder), "no crash", expected, mend)

@@ -28,7 +28,7 @@ from harness.estimators.estimate import Estimate
 from harness.estimators.shells import ShellDetails
 from harness.families import family_named
 from harness.families.protocol import Environment, Family
-from harness.records.folder import read_as, read_manifest
+from harness.records.folder import SHELLS, read_as, read_manifest
 from harness.records.reader import ShownTests, by_kind, read_campaign, read_traces, traffic_of
 from harness.sampling.shells import stored_design
 from harness.strata import ShellDesign, weight_of_a_test
@@ -97,22 +97,23 @@ def typed(path: Path) -> str:
 def read_run_folder(path: Path, content: dict[str, Any] | None = None) -> RunFolder:
     """Read campaign, manifest, tests and, where they are not ``content``, estimates of a run."""
     manifest = read_manifest(path)
-    estimates = STORED_ESTIMATES.validate_python(content or _read_estimates(path, manifest))
+    estimates = STORED_ESTIMATES.validate_python(content or read_estimates(path, manifest))
     campaign = read_campaign(path, manifest)
     tests = ShownTests.stored(path, manifest, family_named(campaign.scenario))
     design = stored_design(path) if campaign.sampling.strata else None
     return RunFolder(path, campaign, manifest, estimates, design, tests, traffic_of(campaign, manifest))
 
 
-def _read_estimates(folder: Path, manifest: Mapping[str, Any]) -> Estimates:
+def read_estimates(folder: Path, manifest: Mapping[str, Any]) -> Estimates:
+    """``estimates.json`` of a run; a `RunFolderError` where it is missing, damaged, or of other tests."""
     path, again = folder / "estimates.json", f"Make it with `harness estimate {folder} --write`."
     if not manifest["n_episodes"]:
         again = "No test is finished: run `harness run` with --resume."
-    campaign_hash, estimates = manifest["campaign_hash"], read_as(Estimates, path, mend=again)
-    if estimates.campaign_hash != campaign_hash:
-        expected = f"those of campaign {campaign_hash} (manifest.json)"
-        found = f"estimates of campaign {estimates.campaign_hash}"
-        raise RunFolderError(str(path), found, expected, again)
+    estimates = read_as(Estimates, path, mend=again)
+    found = f"estimates of {estimates.n_episodes:,} tests of campaign {estimates.campaign_hash}"
+    expected = f"estimates of {manifest['n_episodes']:,} tests of campaign {manifest['campaign_hash']}"
+    if found != expected:
+        raise RunFolderError(str(path), found, f"{expected} (manifest.json)", again)
     if not isinstance(estimates.estimates.get(estimates.headline), Estimate):
         found = f"headline {estimates.headline!r}, of which there is no estimate"
         raise RunFolderError(str(path), found, f"one of {sorted(estimates.estimates)}", again)
@@ -122,13 +123,18 @@ def _read_estimates(folder: Path, manifest: Mapping[str, Any]) -> Estimates:
 def _shells(folder: Path, headline: Estimate, design: ShellDesign) -> ShownShells:
     try:
         of_run = {"rate": headline.crash_rate, "design": design}
-        return TypeAdapter(ShownShells).validate_python({**headline.details, **of_run})
+        shells = TypeAdapter(ShownShells).validate_python({**headline.details, **of_run})
     except ValidationError as error:
         wrong = error.errors(include_url=False)[0]
         found = f"no complete description of shells ({'.'.join(map(str, wrong['loc']))}: {wrong['msg']})"
         expected = "what `harness estimate` writes for a run with testing.method shells"
         mend = f"Make it again with `harness estimate {folder} --write`."
         raise RunFolderError(str(folder / "estimates.json"), found, expected, mend) from error
+    if shells.p_event != design.p_event:
+        found, expected = (f"events of probability {p:.6g} per test" for p in (design.p_event, shells.p_event))
+        mend = "Delete it, and run `harness run` with --resume, which makes what is missing."
+        raise RunFolderError(str(folder / SHELLS), found, f"{expected} (estimates.json)", mend)
+    return shells
 
 
 @dataclass(frozen=True, eq=False)

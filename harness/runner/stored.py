@@ -19,7 +19,7 @@ from harness.campaign.campaign import Campaign
 from harness.campaign.sections import Confidence, EventsPerHour
 from harness.controllers.find import require_controller, run_apart
 from harness.errors import CampaignError, HarnessError, RunFolderError
-from harness.estimators.answer import Estimates, estimate_blocks
+from harness.estimators.answer import estimate_blocks
 from harness.estimators.block import BASELINE_COLUMNS, MOMENT_COLUMNS, Block, block_from_tables
 from harness.estimators.estimate import finite_json
 from harness.estimators.one_pass import asked_for, even
@@ -29,7 +29,7 @@ from harness.families import family_named
 from harness.families.protocol import Environment
 from harness.processes import made_ahead
 from harness.records import reader
-from harness.records.folder import CAMPAIGN, ESTIMATES, Part, no_episodes, read_as, read_kept, read_manifest
+from harness.records.folder import CAMPAIGN, Part, no_episodes, read_as, read_kept, read_manifest
 from harness.records.reader import N_READERS, code_of, read_campaign, require_campaign, require_trust, traffic_of
 from harness.records.schemas import moments_schema, shard_tables
 from harness.report.crashes import COMPARE_AGAIN
@@ -38,7 +38,7 @@ from harness.report.page import write_comparison, write_comparison_of_sum, write
 from harness.report.player import ReplayResult, Scenes, with_lateral
 from harness.report.plots import where_plot
 from harness.report.several import hour_lines
-from harness.report.summary import read_run_folder
+from harness.report.summary import read_estimates, read_run_folder
 from harness.report.words import estimate_lines, run_lines
 from harness.resolved import Resolved, require_world, resolve
 from harness.runner.kept import cpu_name, require_same_pool, versions
@@ -300,7 +300,7 @@ def read_families(folder: Path) -> dict[str, Any]:
         found, expected = "a comparison, or a run of one scenario", "a folder of several, which has families.json"
         mend = "Leave out --exposure: one scenario has no rate per hour, and compare takes --set exposure.lead_brakes=…"
         raise RunFolderError(str(folder), found, expected, mend)
-    return read_as(dict[str, Any], folder / FAMILIES, mend=MEND)
+    return read_as(dict[str, Any], folder / FAMILIES, mend=MEND, key="families")
 
 
 @checked("harness.estimate_families")
@@ -340,7 +340,7 @@ def estimate_families(
         resolved = ready[name] = resolve(read_campaign(run, manifest))
         require_campaign(run / CAMPAIGN, resolved.content_hash, manifest)  # exposures are those of its file
         families.append(FamilyTests(name, exposure_of(resolved, exposures), tests))
-        answers[name] = read_as(Estimates, run / ESTIMATES, mend=MEND), manifest
+        answers[name] = read_estimates(run, manifest), manifest
     answer = hour_answer(PerHour(families), ready, answers, confidence or stored["confidence"], counts=counts)
     ran = stored.pop("ran", None) or {name: stored[name] for name in ("exposure", "decision")}
     was = [exposure_of(resolved, ran["exposure"]).per_hour for resolved in ready.values()]
@@ -373,7 +373,7 @@ def write_report(folder: str | Path) -> Path:
 
 def _write_comparison(folder: Path) -> Path:
     """Write the page of a comparison; where it is a sum, those of its scenarios as well."""
-    stored = read_as(dict[str, Any], folder / COMPARISON, mend=COMPARE_AGAIN)
+    stored = read_as(dict[str, Any], folder / COMPARISON, mend=COMPARE_AGAIN, key="difference")
     if "families" in stored:
         for name in stored["families"]:
             _write_comparison(folder / name)

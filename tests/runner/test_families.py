@@ -244,6 +244,13 @@ def test_a_sum_whose_runs_are_gone_has_nothing_to_replay(run, tmp_path, capsys):
     assert f"error: {tmp_path / 'manifest.json'}" in capsys.readouterr().err
 
 
+def test_estimates_of_another_run_are_refused_in_a_sum(run, tmp_path, capsys):
+    folder = copy_of(run.folder, tmp_path / "run")
+    shutil.copy(folder / NAMES[0] / "estimates.json", folder / NAMES[1])
+    assert main(["estimate", str(folder)]) == 2
+    assert f"error: {folder / NAMES[1] / 'estimates.json'}" in capsys.readouterr().err
+
+
 def test_what_other_traffic_does_to_a_scenario_is_said_once(run):
     """As in the answer of that scenario alone, but at as many events: there are 1.31 times as many per test, too."""
     content = run.content

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import shutil
+
 import pyarrow.parquet as pq
 import pytest
 
 from harness.cli import main
+from harness.commands.printing import system_error
 from harness.errors import RunFolderError
 from harness.records.folder import read_manifest, require_place, sole_use
 from tests.golden.campaigns import BASE, RUNS
@@ -173,7 +176,10 @@ POINT_WITHOUT_RATE = {"n": 1, "ci_low": 0, "ci_high": 1, "rhw": 1}  # which must
         (rewritten(lambda table: table.drop_columns(["log_weight"])), READERS[1:2], "no column 'log_weight'"),
         (lambda run: truncate(run / "estimates.json"), READERS[1:2], "estimates.json"),
         (told(campaign_hash="feedfeedfeedfeed"), READERS[1:2], "feedfeedfeedfeed"),
+        (told(n_episodes=80), READERS[1:2], "estimates of 80 tests"),
         (told(headline="oracle"), READERS[1:2], "oracle"),
+        (lambda run: shutil.copy(run / "estimates.json", run / "families.json"), READERS[:2], "no key families"),
+        (lambda run: shutil.copy(run / "estimates.json", run / "compare.json"), READERS[1:2], "no key difference"),
         (told(convergence=[POINT_WITHOUT_RATE]), READERS[1:2], "convergence.0.crash_rate"),
     ],
 )
@@ -186,6 +192,24 @@ def test_what_is_not_as_it_was_left(damage, commands, said, stored, complaint_of
         assert str(stored) in complaint
         assert said in complaint
     assert not stored.exists() or (stored / "report.html").read_text() == "of an earlier report"
+
+
+def test_shells_of_another_run_are_refused(stored_run, tmp_path, complaint_of):
+    run = copy_of(stored_run("shells-twin"), tmp_path / "run")
+    edit(run, "shells.json", p_event=0.5)
+    assert "shells.json found: events of probability 0.5 per test" in complaint_of("report", run)
+
+
+def test_a_file_that_cannot_be_copied_is_named(tmp_path):
+    """As those of a stored run are by ``harness compare``."""
+    (tmp_path / "a").mkdir()
+    (tmp_path / "a" / "loop").symlink_to("loop")
+    with pytest.raises(shutil.Error) as raised:
+        shutil.copytree(tmp_path / "a", tmp_path / "b")
+    told = system_error(raised.value)
+    assert told is not None
+    assert told.where == str(tmp_path / "a" / "loop")
+    assert told.found.startswith("Too many levels of symbolic links")
 
 
 def test_values_that_no_run_has_written_are_refused(stored):
