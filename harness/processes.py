@@ -185,7 +185,7 @@ def fit_to_travel(error: Exception) -> Exception:
     try:
         pickle.loads(pickle.dumps(error))  # noqa: S301 - our own bytes
     except Exception:  # noqa: BLE001 - exceptions fail to be pickled in many ways
-        return RuntimeError(text)
+        return MemoryError(text) if isinstance(error, MemoryError) else RuntimeError(text)  # none may be left to pickle
     return error
 
 

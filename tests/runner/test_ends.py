@@ -25,6 +25,7 @@ from harness.errors import (
     RunFolderError,
     WorldDisagreementError,
 )
+from harness.processes import fit_to_travel
 from harness.progress import Progress
 from harness.resolved import resolve
 from harness.runner import workers
@@ -265,3 +266,10 @@ def test_memory_of_a_worker_stays_within_ten_percent():
     with ProcessPoolExecutor(1, get_context("spawn")) as process:
         early, late = process.submit(resident_mb).result()
     assert late <= 1.1 * early
+
+
+def test_a_worker_without_memory_says_so():
+    """Also where none is left to pickle its error, as under a limit that a vehicle has set."""
+    error = MemoryError()
+    error.unpicklable = lambda: None
+    assert isinstance(fit_to_travel(error), MemoryError)
