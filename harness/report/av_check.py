@@ -215,7 +215,7 @@ def rows(check: AvCheck) -> list[dict[str, Any]]:
     kind = check.events if follows else f"{check.events} {'that take time' if check.shows else 'of one step'}"
     where = "twin (the motion that SUMO would compute)" if check.engine == "twin" else "SUMO"
     shown = [
-        ("kind of vehicle; where tested; on what", f"{check.source}; {where}; {kind}, {check.method}", ""),
+        ("kind of vehicle; where tested; on what", f"{source}; {where}; {kind}, {check.method}", ""),
         ("tests", check.n_episodes, ""),
         *([(f"failed: {why}", n, "") for why, n in content["failures"].items()] or [("tests that failed", "none", "")]),
         ("tests that differed when run again", content["differing"] or "none", ""),
