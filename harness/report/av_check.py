@@ -211,6 +211,7 @@ def rows(check: AvCheck) -> list[dict[str, Any]]:
     """A table: what was found, beside the built-in IDM."""
     content = check.to_json()
     own, idm = ({**content[f"{who}behaviour"], **content[f"{who}speed"]} for who in ("", "idm_"))
+    source = "TraCI script" if check.script else check.source
     follows = check.follows is not None
     kind = check.events if follows else f"{check.events} {'that take time' if check.shows else 'of one step'}"
     where = "twin (the motion that SUMO would compute)" if check.engine == "twin" else "SUMO"
