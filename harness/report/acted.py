@@ -12,6 +12,7 @@ from harness.numbers import plain, tests
 
 NEVER_BRAKED = f"it never braked with {plain(BRAKED_MPS2)} m/s² or more (below 0): does it see the other vehicle?"
 BRAKES_BEFORE = "in {} it braked with nobody ahead, which makes the event milder"
+SPEEDS_UP_BEFORE = "in {} it asked to speed up before BV was in its lane, and its speed was held"
 
 
 def late_words(scenario: str, *, script: bool) -> str:
@@ -46,6 +47,6 @@ def acted_words(scenario: str, before: Mapping[str, Any] | None) -> Iterator[str
         return
     did = [BRAKES_BEFORE.format(tests(n))] if (n := before["n_braked_before"]) else []
     if (n := before["n_asked_to_speed_up"]) and not before["built_in"]:  # our own models do, which is known
-        did.append(f"in {tests(n)} it asked to speed up before BV was in its lane, and its speed was held")
+        did.append(SPEEDS_UP_BEFORE.format(tests(n)))
     if did:
         yield cruise_words(did, script=before["script"])

@@ -12,7 +12,7 @@ from harness.estimators.limits import clopper_pearson
 from harness.families import family_named
 from harness.loop.cells import BRAKED_MPS2, FAR_BEHIND_S
 from harness.numbers import tests
-from harness.report.acted import BRAKES_BEFORE, NEVER_BRAKED, cruise_words, late_words
+from harness.report.acted import BRAKES_BEFORE, NEVER_BRAKED, SPEEDS_UP_BEFORE, cruise_words, late_words
 from harness.shown import ShownInPython
 
 SLOW_S = 0.1
@@ -59,7 +59,8 @@ class Behaviour:
 
     ``reaction_s`` is the median time from the onset of the event to the first braking beyond 0.1 m/s², over the
     episodes that braked at all; their share is ``braking_share``. ``n_took_over_early`` did something before
-    the event was complete (where it follows: braked), ``n_braked_before`` asked to brake before the onset.
+    the event was complete (where it follows: braked), ``n_braked_before`` asked to brake before the onset, ``n_asked_to_speed_up`` to
+    speed up before the overlap.
     """
 
     mean_acceleration_mps2: float
@@ -73,6 +74,7 @@ class Behaviour:
     n_crashes: int
     n_took_over_early: int
     n_braked_before: int
+    n_asked_to_speed_up: int
 
 
 @dataclass(frozen=True)
@@ -170,6 +172,9 @@ def verdict(check: AvCheck) -> str:
     hides = family_named(check.scenario).words.late[0] and (check.shows or check.follows is not None)
     if hides and check.source == "controller" and not behaviour.n_took_over_early:
         advice += f" But {late_words(check.scenario, script=check.script)}."
+    if check.shows and check.source != "model" and behaviour.n_asked_to_speed_up:
+        asked = SPEEDS_UP_BEFORE.format(tests(behaviour.n_asked_to_speed_up))
+        advice += f" But {cruise_words([asked], script=check.script)}."
     shows = int(1.0 / clopper_pearson(0, n, 0.1)[1])  # with 90 % confidence
     rare = "" if check.source == "model" else f" (a fault in fewer than 1 of {shows} tests may not show: --tests)"
     return (

@@ -77,7 +77,7 @@ def write_comparison_of_sum(folder: Path, stored: dict[str, Any]) -> Path:
     """Write the page of a comparison in several scenarios: the sum, and the way to each one's own page."""
     beside = [several.beside_row("", stored[side]["beside"], seen=stored[side]["n_crashes"] > 0) for side in "ab"]
     scenarios = [
-        (several.called(name), name, pair, several.ratio_words(pair), several.pair_words(pair["decision"]))
+        (several.called(name), name, pair, several.ratio_words(pair), several.pair_words(pair["decision"], pair))
         for name, pair in stored["families"].items()
     ]
     vehicles = [(campaign["label"], ()) for campaign in stored["campaigns"].values()]
@@ -92,7 +92,7 @@ def _write_comparison(
     return write_page(
         folder / "report.html", "compare.html.j2",
         compared=stored, asked=asked, given=asked is not stored, ratio=several.ratio_words(asked),
-        verdict=several.pair_words(stored["decision"]), to_decide=several.deciding_words(stored),
+        verdict=several.pair_words(stored["decision"], asked), to_decide=several.deciding_words(stored),
         warnings=list(several.pair_warnings(stored)), vehicles=[(name, *vehicle) for name, vehicle in sides],
         rates=[several.rates_of(stored[side]) for side in "ab"],
         rows=rows, **content,

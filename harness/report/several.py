@@ -207,15 +207,21 @@ def _scope(content: Mapping[str, Any]) -> str:
 # -- of two vehicles, from ``compare.json`` --
 
 
-def pair_words(decision: Mapping[str, Any]) -> str:
-    """What is known of who crashes less often (``decision`` in ``compare.json``)."""
+def pair_words(decision: Mapping[str, Any], beside: Mapping[str, Any] | None = None) -> str:
+    """What is known of who crashes less often (``decision`` in ``compare.json``), by all looks, and else by one.
+
+    ``beside`` is the ratio A / B with its limits, of one look.
+    """
     margin, verdict = decision["margin"], decision["verdict"]
     if not margin:
         verdicts = {"proven": "B crashes less often than A", "refuted": "B crashes more often than A"}
         of_b, of_a = decision.get("n_milder"), decision.get("n_milder_a")
         held = margin is not None and (of_b or decision.get("n_differing"))
         of_safer = {"proven": of_b, "refuted": of_a, "open": held}[verdict]
-        return verdicts.get(verdict, "Not told apart") + ", see !" * bool(of_safer)
+        least, most = (beside and beside[end] for end in ("ratio_low", "ratio_high"))
+        seems = "less" if (least or 0.0) > 1.0 else "more" if (most or math.inf) < 1.0 else ""
+        open_words = f"Not proven: B seems to crash {seems} often" if seems else "Not told apart"
+        return verdicts.get(verdict, open_words) + ", see !" * bool(of_safer)
     most = share(margin)
     ends = decision.get("ratio") or (None, None)  # of B / A; told as all else, of A / B
     high, low = ("" if not end else ratio(1.0 / end) for end in ends)
@@ -267,7 +273,7 @@ def deciding_words(content: Mapping[str, Any], s_per_pair: float | None = None) 
     cost = "" if s_per_pair is None else f", {duration(n * s_per_pair)}"
     settings = "".join(f" --set {key}={value}" for key, value in needed["settings"].items())
     options = f"--margin {decision['margin'] or 0.0:g}{settings}"
-    where += ", and without stop.rhw" * (content.get("ended") == "rhw")
+    where += ", and without --set stop.rhw, if you gave it" * (content.get("ended") == "rhw")
     return f"to decide, repeat the command with {options}{where}: about {count(n)} {pairs}{cost}"
 
 
@@ -331,7 +337,7 @@ def pair_lines(
     counted = f" above {plain(above)} m/s" if (above := campaign.crash.counts_above_mps) else ""
     scenarios, unit = (scenarios_words(families), "hour") if families else (called(campaign.scenario), "test")
     pairs = f"{count(content['n_pairs'])} pairs of tests, {scenarios}"
-    head = f"{pair_words(decision)} · {pairs} · crashes{counted} per {unit}"
+    head = f"{pair_words(decision, asked)} · {pairs} · crashes{counted} per {unit}"
     last = [*filter(None, [deciding_words(content, s_per_pair)]), scope]
     under = words.wrapped([*(remarks if families else words.few(remarks, 4 - len(last))), *last])
     return [head, *words.columns(rows), *parts, *under, f"  report  {report}"]

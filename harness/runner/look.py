@@ -251,4 +251,5 @@ def _behaviour(shard: Shard, limits: tuple[float, float], did: str, *, early: bo
         n_events=len(reactions), n_crashes=int(np.count_nonzero(episode["outcome"] == CRASH)),
         n_took_over_early=int(np.count_nonzero((took_over >= 0) & (took_over <= episode["event_step"]))),
         n_braked_before=int(np.count_nonzero(episode["braked_before"])),
+        n_asked_to_speed_up=int(np.count_nonzero(episode["asked_to_speed_up"])),
     )  # fmt: skip

@@ -51,7 +51,10 @@ def test_the_numbers_are_those_of_the_comparison(compared, page):
     assert deciding_words(found) is None or "to decide, repeat the command" in shown.lower()
     needed = {"pairs": 90_000, "settings": {}, "new_folder": True}
     left_open = {**found, "to_decide": needed, "ended": "rhw", "decision": {**alike["decision"], "margin": None}}
-    assert "--margin 0 and a new --out, and without stop.rhw: about 90,000 pairs" in deciding_words(left_open)
+    assert (
+        "--margin 0 and a new --out, and without --set stop.rhw, if you gave it: about 90,000 pairs"
+        in deciding_words(left_open)
+    )
     assert len(page.ids) == len(set(page.ids))
 
 
@@ -72,8 +75,10 @@ def test_an_interval_that_excludes_1_beside_an_open_verdict_says_that_it_is_of_o
     found = content_of(compared)
     found |= {"ratio": low, "ratio_low": low, "ratio_high": high, "to_decide": None}
     found["decision"] |= {"verdict": verdict, "margin": None}
-    _, _, _, ratio_row, *_ = pair_lines(found, read_run_folder(compared / "a").campaign, compared)
+    head, _, _, ratio_row, *_ = pair_lines(found, read_run_folder(compared / "a").campaign, compared)
     assert ratio_row.endswith("over all looks; interval: of one look") == said
+    seems = f"Not proven: B seems to crash {'less' if low > 1.0 else 'more'} often · "
+    assert head.startswith(seems if said else "Not told apart · " if verdict == "open" else "B crashes more often")
 
 
 def test_the_map_holds_each_pair_with_a_crash(compared, page):

@@ -249,6 +249,8 @@ def test_a_vehicle_that_waits_for_the_overlap_is_told_so(name, late):
     found = check_av(load_campaign(f"{__name__}:{name}", ["world.engine=twin"]), 6)
     assert (found.shows, "bv_lateral_m > 0 shows it earlier" in verdict(found)) == (True, late)
     assert verdict(found).startswith("READY") == late  # the other one brakes with nobody ahead
+    eager = replace(found, behaviour=replace(found.behaviour, n_asked_to_speed_up=1))
+    assert ("But in 1 test it asked to speed up before BV was in its lane" in verdict(eager)) == late
 
 
 def test_the_command_line(capfd):
