@@ -254,7 +254,7 @@ REFUSED = (
     Combination(
         "environments",
         lambda c, _: bool(set(c.environments) - set(c.scenarios or ()) | {DEFAULT_FAMILY} & set(c.environments)),
-        "{environments}: one is of a scenario that is not among scenarios ({scenarios}), or of cut_in",
+        "{environments}: of cut_in, or of a scenario that is not among scenarios",
         "files of the others that are tested",
         "Name it among scenarios; that of cut_in, or of one scenario alone, is environment.parameters.",
     ),

@@ -6,7 +6,7 @@ import hashlib
 import re
 import shlex
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, ClassVar, Literal, Self
 
 from pydantic import BaseModel, Field, field_validator, model_validator
 
@@ -104,6 +104,7 @@ class FmuController(Section):
 class AutomatedVehicle(Section):
     """The automated vehicle under test: one of model, controller, sumo, traci and fmu."""
 
+    example: ClassVar[str] = "{controller: my_av.py:MyAV} or {model: r157-cc}"
     model: ModelName | None = Field(None, description="built-in driver model, idm where nothing is named")
     controller: str | None = Field(
         None, pattern=CONTROLLER_PATTERN, examples=["my_av.py:MyClass", "my_package.my_module:MyClass"]

@@ -87,7 +87,8 @@ def _exposures(ctx: click.Context, parameter: click.Parameter, texts: tuple[str,
             per_hour[name] = click.FloatRange(*EXPOSURES)(value, parameter, ctx)
         except click.BadParameter:
             expected = "events per hour of driving, {:g} to {:g}".format(*EXPOSURES)
-            raise HarnessError(where, f"'{value}'", expected, f"Write --exposure {name}=0.1, one each.") from None
+            mend = f"Write --exposure {name}=0.1, one each; or leave it out of --scenario."
+            raise HarnessError(where, f"'{value}'", expected, mend) from None
     return per_hour
 
 

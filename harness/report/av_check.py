@@ -59,8 +59,8 @@ class Behaviour:
 
     ``reaction_s`` is the median time from the onset of the event to the first braking beyond 0.1 m/s², over the
     episodes that braked at all; their share is ``braking_share``. ``n_took_over_early`` did something before
-    the event was complete (where it follows: braked), ``n_braked_before`` asked to brake before the onset, ``n_asked_to_speed_up`` to
-    speed up before the overlap.
+    the event was complete (where it follows: braked), ``n_braked_before`` asked to brake before the onset, and
+    ``n_asked_to_speed_up`` to speed up before the overlap.
     """
 
     mean_acceleration_mps2: float

@@ -191,7 +191,8 @@ def _scope(content: Mapping[str, Any]) -> str:
     ended, target = words.ended_words(content["stopped_by"], content["decision"]), content["asked_rhw"]
     if content["stopped_by"] == "rhw" and (rhw := content["per_hour"]["rhw"] or math.inf) > 1.005 * target:
         here = words.reached_words(rhw, share(rhw)).removeprefix(", at ")
-        ended += f" as it was run; here {here}: to narrow it, run anew with these settings"
+        narrower = "" if content["counts_in_interval"] else ": to narrow it, run anew with these settings"
+        ended += f" as it was run; here {here}{narrower}"
     if content["stopped_by"] == "accept" and content["decision"] is None:
         ended += f" ({content['ran']['decision']['verdict']}) at the exposures of the run"
     if content["stopped_by"] not in ("rhw", "accept", "below_reference") and target is not None:

@@ -39,7 +39,7 @@ from harness.vehicles.drivers import Followers, driver_records
 
 SHARD_RUNS = 50
 """Baseline runs of one task: half a second of a slow controller."""
-IN_WORDS = {SHADOW: "baseline runs", MILDER: "milder events"}
+IN_WORDS = {SHADOW: "baseline runs", MILDER: "milder events, in no rate"}
 """What the rows of each table are."""
 N_MILDER = 36
 """Tests of milder events: a vehicle that crashes on a tenth of them is found out 98 times in 100."""

@@ -41,7 +41,7 @@ MISTAKES = (
     ("accept: r157-cc", "accept", 2, "crash_rate_below, times_reference. Write {times_reference: {driver: r157-cc}}"),
     ("scenarios: all", "scenarios", 2, "a list"),
     ("exposure: 3", "exposure", 2, "names, each with its value"),
-    ("av: my_av.py:MyAV", "av", 2, "a section with keys such as model, controller"),
+    ("av: my_av.py:MyAV", "av", 2, "Write {controller: my_av.py:MyAV} or {model: r157-cc} there."),
     ("av:\n  limits: {max_braking_mps2: 8}", "av.limits.max_braking_mps2", 3, "Did you mean 'min_acceleration_mps2'?"),
     ("av:\n  limits: {min_acceleration_mps2: 8}", "av.limits.min_acceleration_mps2", 3, "min_acceleration_mps2: -8."),
     ("world:", "world", 2, "delete the key for its default"),
