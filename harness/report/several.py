@@ -174,7 +174,7 @@ def exposures(content: Mapping[str, Any]) -> str:
             phrases[kind][-1] += f" (crashes up to × {number(moved.most, 2)} if {others})"
     parts = [f"{kind}: {', '.join(scenarios)}" for kind, scenarios in phrases.items()]
     more = "other numbers: harness sensitivity"
-    if (ends := content["per_hour"]["over_assumed"]) is not None and ends[0] < ends[1]:
+    if (ends := content["per_hour"].get("over_assumed")) is not None and ends[0] < ends[1]:  # older runs have none
         more = f"rate over assumed ranges {' to '.join(number(end, 2) for end in ends)}"
     return f"events per hour, {'; '.join([*parts, more])}"
 

@@ -244,6 +244,14 @@ def test_a_sum_whose_runs_are_gone_has_nothing_to_replay(run, tmp_path, capsys):
     assert f"error: {tmp_path / 'manifest.json'}" in capsys.readouterr().err
 
 
+def test_a_sum_of_before_its_range_over_what_is_assumed_has_its_page(run, tmp_path):
+    folder = copy_of(run.folder, tmp_path / "run")
+    content = json.loads((folder / "families.json").read_text())
+    del content["per_hour"]["over_assumed"]
+    write_sealed(folder / "families.json", content)
+    assert main(["report", str(folder)]) == 0
+
+
 def test_estimates_of_another_run_are_refused_in_a_sum(run, tmp_path, capsys):
     folder = copy_of(run.folder, tmp_path / "run")
     shutil.copy(folder / NAMES[0] / "estimates.json", folder / NAMES[1])
