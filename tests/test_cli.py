@@ -127,6 +127,8 @@ def test_an_option_without_its_value_is_told_by_its_command(capsys):
         ("run --scenario lead_brake", "fix:      Write --scenario lead_brakes."),
         ("run --scenario cut-in,lead_brake", "fix:      Write --scenario cut_in,lead_brakes."),
         *((f"run --accept {wrong}", "accept.times_reference") for wrong in ("0.5xr157-cc", "0,5*r157-cc")),
+        ("run --av r157-cc", "found:    a second vehicle, beside idm"),
+        ("run --accept 1e-7/h", "fix:      Write one of these."),
         ("run --accept 50%", "expected: crashes per test (3e-7), or a driver (r157-cc, 0.5*r157-cc)"),
         ("run --accept r157cc", "fix:      Did you mean 'r157-cc'?"),
         ("run --accept -1", "fix:      Correct it; the key means: crashes per test"),

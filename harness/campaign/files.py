@@ -66,6 +66,8 @@ def load_campaign(
     """
     vehicle = [] if av is None else [Override(("av",), named_vehicle(av, "--av "), f"--av {av}")]
     of_file = names_a_campaign(path)
+    if vehicle and not of_file:
+        raise CampaignError(f"--av {av}", f"a second vehicle, beside {path}", "one", "Leave one of both out.")
     data, lines = read_yaml(path) if of_file else (_default_campaign(str(path)), {})
     typed = [parse_override(text) for text in overrides]
     place = Places(str(path), lines, [*vehicle, *_nothing_sooner(typed), *typed])

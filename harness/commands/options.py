@@ -158,7 +158,7 @@ def accepting(limit: str) -> list[str]:
             times, driver = driver, times
         if not star:  # 0.5r157-cc can mean nothing else
             times, driver = re.findall(r"^([\d.]*)(.*)$", limit)[0]
-        if not re.match(r"\s*\w", driver):
+        if not re.fullmatch(r"\s*[A-Za-z0-9][\w.-]*\s*", driver):
             expected = "crashes per test (3e-7), or a driver (r157-cc, 0.5*r157-cc)"
             raise HarnessError("--accept", limit, expected, "Write one of these.") from None
         keys = ("times_reference", "crash_rate_below")

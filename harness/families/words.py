@@ -11,6 +11,8 @@ from harness.vocabulary import FloatArray
 
 EXCLUDED = "the fitted data exclude it"
 """Marks the note of an exposure that a fit has kept, although the few events that it counted exclude it."""
+ELSEWHERE = "in other trajectories than this traffic’s"
+"""Marks the source of an exposure that is not of the trajectories which the traffic was fitted to."""
 
 
 class Words(NamedTuple):

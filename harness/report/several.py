@@ -11,7 +11,7 @@ from harness.campaign.campaign import Campaign
 from harness.estimators.answer import AssumedOfRate, n_softened
 from harness.estimators.estimate import WIDE_RHW
 from harness.families import family_named
-from harness.families.words import EXCLUDED
+from harness.families.words import ELSEWHERE, EXCLUDED
 from harness.numbers import count, duration, interval, number, plain, ratio, share, tenths, two_digits_up
 from harness.report import words
 from harness.report.notes import note_words
@@ -167,8 +167,8 @@ def exposures(content: Mapping[str, Any]) -> str:
         is_given = exposure["low"] == exposure["high"] and exposure["source"] != "assumed"
         kind = "counted" if exposure["counted"] else "given" if is_given else "assumed"
         phrases.setdefault(kind, []).append(f"{called(name)} {plain(float(format(exposure['per_hour'], '.2g')))}")
-        if EXCLUDED in exposure["source"]:
-            phrases[kind][-1] += f" ({EXCLUDED})"
+        for mark in (EXCLUDED, ELSEWHERE):
+            phrases[kind][-1] += f" ({mark})" * (mark in exposure["source"])
         assumed = family["n_crashes"] and family.get("assumed")
         if assumed and (others := looking_words(moved := AssumedOfRate(**assumed))):
             phrases[kind][-1] += f" (crashes up to × {number(moved.most, 2)} if {others})"

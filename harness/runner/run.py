@@ -27,6 +27,7 @@ from harness.estimators.per_hour import FamilyTests, PerHour, own_exposure
 from harness.estimators.shells import SeenShells
 from harness.estimators.stopping import Decision, RoundRule
 from harness.families.protocol import FAR_ABOVE, Exposure
+from harness.families.words import ELSEWHERE
 from harness.printed import PRINTED
 from harness.problems import listed
 from harness.progress import Progress
@@ -204,6 +205,8 @@ def hour_answer(
 def exposure_of(resolved: Resolved, own_exposures: Mapping[str, float]) -> Exposure:
     """How often events of a scenario are met per hour: the shipped number, or the campaign's own."""
     shipped = resolved.family.exposure(resolved.environment, resolved.parameters)
+    if resolved.parameters.replicates is not None and not hasattr(resolved.parameters, "exposure"):  # a fit has none
+        shipped = shipped._replace(source=f"counted {ELSEWHERE}: {shipped.source}")
     name = resolved.campaign.scenario
     if (own := own_exposures.get(name)) is not None and own > FAR_ABOVE * shipped.high:
         times = f"{own / shipped.per_hour:.0f} times the shipped one, of events in scope"

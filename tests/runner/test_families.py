@@ -6,6 +6,7 @@ import json
 import math
 import re
 import shutil
+from dataclasses import replace
 
 import pytest
 
@@ -14,7 +15,7 @@ from harness.cli import main
 from harness.errors import CampaignError, HarnessError, RunFolderError
 from harness.estimators.stopping import Decision
 from harness.estimators.traffic import Bar, Sensitivity
-from harness.families.words import EXCLUDED
+from harness.families.words import ELSEWHERE, EXCLUDED
 from harness.numbers import number, share
 from harness.numbers import ratio as shown_ratio
 from harness.pool import moved
@@ -26,6 +27,7 @@ from harness.report.several import family_rows, hour_lines
 from harness.resolved import resolve
 from harness.runner import other_traffic
 from harness.runner.compare import compare_campaigns
+from harness.runner.run import exposure_of
 from harness.runner.stored import estimate_families, read_families
 from tests.in_process import one_process, run_here, run_with_workers
 from tests.stored_runs import copy_of
@@ -271,6 +273,13 @@ def test_what_other_traffic_does_to_a_scenario_is_said_once(run):
     kept = {**brakes, "exposure": {**brakes["exposure"], "source": f"assumed; {EXCLUDED}: 0 in 200 h of following"}}
     fitted = " ".join(hour_lines({**content, "families": {**content["families"], "lead_brakes": kept}}))
     assert f"lead brakes 0.1 ({EXCLUDED})" in " ".join(fitted.split())
+    resolved = resolve(campaign().of_family("cut_in"))
+    fitted_too = replace(resolved, parameters=resolved.parameters.model_copy(update={"replicates": "of a fit"}))
+    assert ELSEWHERE in exposure_of(fitted_too, {}).source
+    assert ELSEWHERE not in exposure_of(resolved, {}).source
+    elsewhere = {**content["families"]["cut_in"], "exposure": exposure_of(fitted_too, {})._asdict()}
+    told = " ".join(hour_lines({**content, "families": {**content["families"], "cut_in": elsewhere}}))
+    assert f"cut-in 0.048 ({ELSEWHERE}) (crashes up to" in " ".join(told.split())
     verdict = Decision(1.0, "assumption_free", 0.95, 2.5, 40.0, driver="r157-cc").to_json()
     report = run.folder / "report.html"
     assert (len(hour_lines(content, report)), len(hour_lines({**content, "decision": verdict}, report))) == (10, 12)
