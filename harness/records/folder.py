@@ -170,12 +170,19 @@ def arrow_file(content: bytes) -> pa.BufferReader:
     return pa.BufferReader(sink.getvalue())
 
 
+def _content(path: Path) -> bytes:
+    """Content of a file; a pipe in its place is an `OSError`, where nobody may ever write."""
+    if path.is_fifo():
+        raise OSError("a pipe")
+    return path.read_bytes()
+
+
 def read_table(
     path: Path, columns: list[str] | None = None, *, crc32: int | None = None, mend: str = MEND_PART
 ) -> pa.Table:
     """Read one Parquet file of a run; its checksum ``crc32`` is verified or, without one, those of its pages."""
     try:
-        content = path.read_bytes()
+        content = _content(path)
         require_sum(path, crc32, content, mend)
         # Faster than read_table by a millisecond.
         with pq.ParquetFile(arrow_file(content), page_checksum_verification=crc32 is None) as file:
@@ -295,7 +302,7 @@ def read_as(kind: type[T], path: Path, *, mend: str, key: str = "") -> T:
     """Read a JSON file of a run as a type, with a key; what no run has written is refused by its first wrong value."""
     expected = "a JSON file of a run"
     try:
-        content = path.read_bytes()
+        content = _content(path)
         value = TypeAdapter(kind).validate_json(content, strict=True)
         values = json.loads(content)
     except (OSError, UnicodeDecodeError) as error:

@@ -20,7 +20,7 @@ import pytest
 
 from harness.errors import HarnessError, RunFolderError
 from harness.files import write_atomically
-from harness.records.folder import arrow_file, parquet, write_json, write_together
+from harness.records.folder import arrow_file, parquet, read_as, read_table, write_json, write_together
 from harness.report.summary import read_run_folder, summarise
 from harness.runner.stored import estimate_run, replay_episode
 from harness.runner.tables import read
@@ -218,6 +218,14 @@ def test_the_campaign_of_another_run_is_refused(crc32, stored, stored_run):
     for reading in (estimate_run, read_run_folder):
         with pytest.raises(RunFolderError, match=r"campaign\.yaml"):
             reading(stored)
+
+
+def test_a_pipe_in_a_files_place_is_not_waited_for(tmp_path):
+    os.mkfifo(tmp_path / "x")
+    with pytest.raises(RunFolderError, match=r"cannot be read .a pipe"):
+        read_table(tmp_path / "x")
+    with pytest.raises(RunFolderError, match=r"cannot be read .a pipe"):
+        read_as(dict, tmp_path / "x", mend="Delete it.")
 
 
 def test_json_is_strict(tmp_path):

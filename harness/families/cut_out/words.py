@@ -8,6 +8,7 @@ from harness.families.words import Shown
 WORDS = words_of_following(
     called="cut-out",
     event="cut-out",
+    test="one cut-out, most often a harmless one",
     since="the lane was clear",
     kicker="How often an automated vehicle (AV) collides with a slower vehicle (SV) that the one ahead (LV) reveals "
     "when it leaves the lane, on a motorway",
@@ -27,6 +28,6 @@ CLOSING = Shown(
     lambda tests: tests["closing_mps"], beyond=1.15, cell=1.0,
 )  # fmt: skip
 TTC = Shown(
-    "time to collision of both when the lane is clear", "s", ("TTC when", "clear"),
+    "time to collision when the lane is clear", "s", ("TTC when", "clear"),
     lambda tests: tests["ttc_when_clear_s"], beyond=1.2, cell=0.25,
 )  # fmt: skip
