@@ -151,8 +151,9 @@ class ParameterFile(Section):
     def _is_like_another(cls, content: Any) -> Any:
         if not isinstance(content, dict):
             return content
-        own = get_args(cls.model_fields["format"].annotation)
-        if (found := content.get("format", own[0])) not in own:
+        field = cls.model_fields.get("format")  # a family may have none
+        own = get_args(field.annotation) if field else ()
+        if own and (found := content.get("format", own[0])) not in own:
             mend = "Name the file of this scenario: `harness fit` writes one for each."
             raise broken_rule("format", describe_found(found), own[0], mend)
         return completed(content, cls.folder)

@@ -195,7 +195,8 @@ def _scope(content: Mapping[str, Any]) -> str:
         ended += f" as it was run; here {here}{narrower}"
     if content["stopped_by"] == "accept" and content["decision"] is None:
         ended += f" ({content['ran']['decision']['verdict']}) at the exposures of the run"
-    if content["stopped_by"] not in ("rhw", "accept", "below_reference") and target is not None:
+    by_precision = target is not None and content["decision"] is None
+    if content["stopped_by"] not in ("rhw", "accept", "below_reference") and by_precision:
         rhw = content["per_hour"]["rhw"]
         ended += f"{'' if rhw is None else words.reached_words(rhw, share(rhw))} (asked: ± {share(target)})"
     if content["stopped_by"] == "episodes" and (target is not None or content["decision"] is not None):
