@@ -230,11 +230,6 @@ REFUSED = (
         "shells: rates of several kinds of events are one sum over strata", "Choose shells, or write one scenario.",
     ),
     Combination(
-        "accept", lambda c, _: c.scenarios is not None and c.accept is not None and c.accept.times_reference is None,
-        "a limit of crashes per test, with several scenarios", "times_reference: their tests are not of one kind",
-        "Write accept: {times_reference: {driver: r157-cc}} (--accept r157-cc), or one scenario.",
-    ),
-    Combination(
         "testing.shells.statement",
         lambda c, _: c.scenarios is not None and c.testing.shells.statement != "assumption_free",
         "{testing.shells.statement}, with several scenarios",

@@ -259,7 +259,7 @@ class Accept(Section):
 
     example: ClassVar[str] = "{times_reference: {driver: r157-cc}}"
     crash_rate_below: float | None = Field(None, gt=0.0, lt=1.0)
-    """crashes per test: accepted below it, rejected above"""
+    """crashes per test, of several scenarios per hour of driving: accepted below it, rejected above"""
     times_reference: TimesReference | None = Field(None, description="the same beside a reference driver")
 
     @property

@@ -76,8 +76,8 @@ def check(
 @click.option("--resume", is_flag=True, help="Go on with what the run folder already holds.")
 @click.option(
     "--accept", metavar="RATE|DRIVER",
-    help="Run until it is known whether the crash rate is below this limit: crashes per test, or that of a reference "
-    "driver, r157-cc or 0.5*r157-cc. Replaces stop.rhw, and `accept` of the campaign.",
+    help="Run until it is known whether the crash rate is below this limit: crashes per test (of several scenarios per "
+    "hour), or that of a reference driver, r157-cc or 0.5*r157-cc. Replaces stop.rhw, and `accept` of the campaign.",
 )  # fmt: skip
 @click.option(
     "--independent", type=click.IntRange(min=0, max=2**63 - 1), metavar="N",

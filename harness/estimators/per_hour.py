@@ -222,10 +222,10 @@ class PerHour:
         """The competent driver of all, and its rate; None where that never crashes."""
         return ("", self.reference_rate) if self.reference_rate > 0.0 else None
 
-    def expected(self, limit: float, _driver: str | None, _statement: str) -> float:
-        """Crashes that these tests would have brought at a multiple of the reference rate, see `SeenShells`."""
+    def expected(self, limit: float, driver: str | None, _statement: str) -> float:
+        """Crashes that these tests would have brought at a limit per hour, or of a ``driver``; see `SeenShells`."""
         events = math.fsum(float(family.p.sum()) for family in self.families)
-        return limit * self.reference_rate * self.totals[0] / events
+        return limit * (1.0 if driver is None else self.reference_rate) * self.totals[0] / events
 
     def beside(self, _driver: str, _statement: str, level: Level) -> tuple[float, float]:
         """Limits of `ratio`."""

@@ -44,7 +44,8 @@ def statement_case(content: dict[str, Any], message: str, statement: str, exit_c
     asks = bool(within) and statement == LIBRARY_STATEMENT
     outcome = "failure" if asks and within["refuted"] else OUTCOMES.get(exit_code, "failure")
     if (decision := content.get("decision")) is not None:
-        name += f" below {limit_words(decision)}"
+        limit = limit_words(decision, "hour" if "families" in content else "test")
+        name = f"crashes below {limit}" if limit.endswith("per hour") else f"{name} below {limit}"
     return Case(f"{name}, given the {LIBRARY_STATEMENT}" if asks else name, message, outcome)
 
 

@@ -130,10 +130,10 @@ def _share_within(value: float, limits: tuple[float, float] | None, suffix: str)
     return "" if high - low > ANY_SHARE else f"{share(value)} ({100.0 * low:.0f}–{100.0 * high:.0f} %){suffix}"
 
 
-def limit_words(decision: Mapping[str, Any]) -> str:
-    """What a verdict is about."""
+def limit_words(decision: Mapping[str, Any], per: str) -> str:
+    """What a verdict is about: a rate ``per`` test or hour, or that of a driver."""
     driver = decision.get("driver")
-    return f"{plain(decision['limit'])} × {driver}" if driver else f"{plain(decision['limit'])} per test"
+    return f"{plain(decision['limit'])} × {driver}" if driver else f"{plain(decision['limit'])} per {per}"
 
 
 def held_back(decision: Mapping[str, Any]) -> bool:
@@ -141,9 +141,9 @@ def held_back(decision: Mapping[str, Any]) -> bool:
     return bool(decision["verdict"] == "undecided" and end(decision["high"]) < decision["limit"])
 
 
-def decided(decision: Mapping[str, Any]) -> Row:
-    """The verdict on a limit, of one scenario or of several."""
-    limit, verdict = limit_words(decision), decision["verdict"]
+def decided(decision: Mapping[str, Any], per: str = "test") -> Row:
+    """The verdict on a limit, of one scenario or, ``per`` hour, of several."""
+    limit, verdict = limit_words(decision, per), decision["verdict"]
     low, high = number(decision["low"]), number(end(decision["high"]))
     open_above = f"at least {low}" if decision["low"] else "nothing is known yet"
     value, ends = {

@@ -37,7 +37,7 @@ def scenarios_words(families: Sized) -> str:
 
 def answer_of_sum(content: Mapping[str, Any], *, readings: bool = False) -> ShortAnswer:
     """The answer of ``families.json``; with ``readings`` also beside others of the regulation's driver."""
-    verdict = [] if content["decision"] is None else [decided(content["decision"])]
+    verdict = [] if content["decision"] is None else [decided(content["decision"], "hour")]
     return ShortAnswer(
         vehicle=content["vehicle"],
         parameters=content.get("parameters", ()),
@@ -123,7 +123,7 @@ def sum_warnings(content: Mapping[str, Any]) -> Iterator[str]:
     """What changes the meaning of the rows, a line each, by scenario."""
     decision = content.get("decision")
     if decision and (verdict := decision["verdict"]) != "undecided":
-        beside = decision["driver"] and content["beside"]["over_assumed"]
+        beside = content["beside" if decision["driver"] else "per_hour"]["over_assumed"]
         ranges = [each for each in (decision.get("over_assumed"), beside) if each]
         low = min((each[0] for each in ranges), default=math.inf)
         high = max((end(each[1]) for each in ranges), default=0.0)

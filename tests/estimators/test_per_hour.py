@@ -166,6 +166,20 @@ def test_who_does_not_look_moves_the_ratio_of_the_sum_while_events_per_hour_stay
     assert PerHour([unseen, THREE[1]]).over_assumed() == PerHour(THREE[:2]).over_assumed()  # it has a line of its own
 
 
+def test_a_limit_per_hour_is_that_times_the_rate_of_a_known_driver():
+    """The driver's rate is known here: the same tests come to the same verdict, at the same limits."""
+    hour, sets = PerHour(THREE), "accept={{{}}}".format
+    rate = hour.reference_rate
+    for times in (0.5, 2.0, 40.0):
+        by_driver = sets(f"times_reference: {{driver: r157-cc, at_most: {times}}}")
+        rules = [RoundRule(load_campaign("idm", ["scenarios=[cut_in, lead_brakes]", "stop.rhw=null", each]))
+                 for each in (by_driver, sets(f"crash_rate_below: {times * rate}"))]  # fmt: skip
+        assert rules[0].observe(hour) == rules[1].observe(hour)
+        driver, alone = (rule.look.decision for rule in rules)
+        assert alone.verdict == driver.verdict
+        assert (alone.low, alone.high) == pytest.approx((driver.low * rate, driver.high * rate), rel=1e-6)
+
+
 def test_a_verdict_stays_while_a_folder_holds_further_tests():
     """Looked at without it, the same tests leave it open."""
     accept = {"times_reference": {"driver": "r157-cc", "at_most": 1.0}}
