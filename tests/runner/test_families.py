@@ -167,11 +167,18 @@ def test_a_budget_that_leaves_a_scenario_without_tests_is_refused_and_may_be_rai
     assert bits(again.folder) == bits(run.folder)
 
 
-def test_a_verdict_is_of_the_exposures_that_it_was_reached_with(tmp_path):
-    asked = {"times_reference": {"driver": "r157-cc"}}
+@pytest.mark.parametrize(
+    ("asked", "told"),
+    [
+        ({"times_reference": {"driver": "r157-cc"}}, "rate above 1 × r157-cc"),
+        ({"crash_rate_below": 1e-5}, "rate above 1 × 10⁻⁵ per hour"),
+    ],
+)
+def test_a_verdict_is_of_the_exposures_that_it_was_reached_with(asked, told, tmp_path):
     run = run_here(campaign(f"accept={asked}", "stop.rhw=null"), tmp_path / "run")
     verdict = run.content["decision"]
     assert verdict["verdict"] == "rejected"
+    assert f"REJECTED {told} confidence 0.95" in " ".join(repr(run).split())
     assert estimate_families(run.folder, confidence=0.5)["decision"] == verdict
     other = estimate_families(run.folder, {"lead_brakes": 1e-6})
     assert other["decision"] is None
@@ -197,7 +204,6 @@ def test_exposures_out_of_all_bounds_are_refused(wrong, run, capsys):
     ("overrides", "where"),
     [
         (["testing.method=forced", "stop.rhw=null"], "testing.method"),
-        (["accept.crash_rate_below=1e-7"], "accept"),
         (["pool.library=ladder-2"], "pool.library"),
         (["testing.shells.statement=library"], "testing.shells.statement"),
         (["accept={times_reference: {driver: r157-fsm}}", "stop.rhw=null"], "accept.times_reference.driver"),
@@ -222,6 +228,8 @@ def test_where_few_tests_reject_only_the_lower_ends_are_told(run, rhw, low, show
     told = "\n".join(hour_lines({**content, "beside": beside | {"ratio_low": 2.5, "ratio_high": 900.0}}))
     ratio = "> 2.50 (crashes more)" in told
     used_up = {**content, "stopped_by": "episodes", "asked_rhw": 0.3, "per_hour": {**per_hour, "rhw": 1e3 * rhw}}
+    assert "asked: ±" not in " ".join(hour_lines(used_up))  # of a limit, at which it would have ended
+    used_up["decision"] = None
     assert "at over ± 1,000 % (asked: ± 30 %)" in " ".join(" ".join(hour_lines(used_up)).split())
     assert ("crashes so far      > 1.00 × 10⁻³ per hour" in told, ratio, "to 900" in told) == (shown, shown, not shown)
 
