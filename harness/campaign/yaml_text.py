@@ -79,6 +79,8 @@ def read_text(path: Path) -> str:
         found, mend = f"more than {LARGEST_FILE:,} bytes", "Is it the right file?"
     except FileNotFoundError:
         meant = did_you_mean(path.name, [file.name for file in path.parent.glob("*.y*ml")])
+        if (cloned := Path(__file__).parents[2] / path).is_file():  # as docs name those beside this package
+            meant = f"Write {cloned}."
         found, mend = "no such file", meant or "Check the spelling and the folder that you are in."
     except IsADirectoryError:
         of_run = path / "campaign.yaml"

@@ -222,6 +222,12 @@ def test_the_folder_of_a_run_is_told_by_its_campaign(tmp_path):
         read_yaml(tmp_path)
 
 
+def test_a_file_of_the_clone_is_told_where_it_is(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(CampaignError, match=rf"no such file; .*Write {FOLDER}/smoke\.yaml"):
+        load_campaign("scenarios/smoke.yaml")
+
+
 def test_byte_order_mark_is_no_content(read):
     assert read(b"\xef\xbb\xbfa: 1")[0] == {"a": 1}
 

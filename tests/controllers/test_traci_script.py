@@ -288,7 +288,7 @@ def test_a_stored_answer_is_the_same_when_the_script_has_gone_or_is_broken(tmp_p
     run_here(load_campaign(f"{file}", asked), tmp_path / "run")
     told = answer_in(tmp_path / "run")
     assert told["parameters"] == [["type", "accel 2.6, decel 4.5, minGap 0"], ["step", "1 s"]]
-    assert "its getLateralLanePosition < 0 shows it" in "".join(told["warnings"])
+    assert "BV’s getLateralLanePosition < 0 shows it" in "".join(told["warnings"])
     file.write_bytes(b"\xff")
     assert answer_in(tmp_path / "run") == told
     file.unlink()

@@ -41,7 +41,7 @@ WORDS = Words(
     unlikely="It is small because most naturalistic tests end without a cut-in, and so without a crash.",
     tests=_tests,
     rests=_rests,
-    late=("the other car (BV) was in its lane", "bv_lateral_m > 0", "its getLateralLanePosition < 0"),
+    late=("the other car (BV) was in its lane", "bv_lateral_m > 0", "BV’s getLateralLanePosition < 0"),
 )
 AT_OVERLAP = GAP._replace(words="gap at the overlap", head=("Gap at", "overlap"))
 STAND_INS = MappingProxyType(
