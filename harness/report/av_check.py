@@ -45,8 +45,8 @@ CAUSES: dict[Cause, str] = {
     "remembers": "It differs after another test: it remembers the last one. Set all its state in start.",
     "shares": "It differs beside other vehicles: they share something. Keep state in self, not in the class or module.",
     "random": "It differs although all else is equal: random numbers of its own (random, numpy.random), or a variable "
-    "of its module or class that outlives the object. Draw from episode.random in start (a script: from `random`, which "
-    "has a new stream in each test); keep state in self.",
+    "of its module or class that outlives the object. Draw from episode.random in start (a script: from `random`, "
+    "which has a new stream in each test); keep state in self.",
     "process": "It differs from process to process: random numbers of its own (random, numpy.random), the number of "
     "the process, hash() of a text (the order of a set), an id(), or what earlier tests have left in a variable of its "
     "module or class. Draw from episode.random in start; keep state in self.",
