@@ -90,7 +90,7 @@ def _parts(details: ErrorDetails, section: type[BaseModel]) -> dict[str, str]:
         expected += ", or null" if field and len(loc) == 1 and type(None) in get_args(field.annotation) else ""
     if kind.startswith("less_than") and 0 in context.values():
         mend = f"Write {last}: -{value}."
-    elif kind.startswith("less_than") and 0.9 < next(iter(context.values())) <= 1.0 < value <= 100.0:  # per cent
+    elif kind.startswith("less_than") and last.endswith(("confidence", "share")) and 1.0 < value <= 100.0:  # per cent
         mend = f"Write {last}: {value / 100.0:g}."
     return {"key": key, "found": found, "expected": expected, "mend": mend}
 
