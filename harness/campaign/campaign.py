@@ -206,8 +206,12 @@ _FOLLOWS = "in {scenario}, where the AV follows a vehicle from the start"
 
 
 def _waits(key: str, usual: Any) -> Combination:
+    """Refuses what differs from `WAITS` where the AV follows."""
+
+    def differs(c: Campaign, use: Use) -> bool:
+        return use.follows and bool(getattr(c.av, key) != usual)
+
     found, expected = f"{{av.{key}}}, {_FOLLOWS}", f"{usual}, which means nothing there: the vehicle drives in any case"
-    differs = lambda c, use: use.follows and getattr(c.av, key) != usual  # noqa: E731 - as in the table
     return Combination(f"av.{key}", differs, found, expected, "Delete the key.")
 
 

@@ -200,7 +200,7 @@ class AutomatedVehicle(Section):
 
 
 WAITS = {key: AutomatedVehicle.model_fields[key].default for key in ("before_event", "takes_over", "warm_up_s")}
-"""What a vehicle does until the event, and is usual; all of it means nothing where it follows from the start."""
+"""Defaults of keys on what a vehicle does until the event: they mean nothing where it follows from the start."""
 
 
 class Panel(Section):

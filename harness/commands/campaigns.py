@@ -308,8 +308,8 @@ def pool(campaign_file: Path, *, scenario: str | None, overrides: Sequence[str],
     With VEHICLE it is the pool that `harness run VEHICLE` draws from; the vehicle itself does not matter. Shown are the
     surrogates from careful to careless, with their crash rates and the probabilities of their shells: the events on
     which a surrogate crashes and no more careful one does. `p event` is the probability of an event in a test, `no
-    surrogate crashes` that of one that all survive; beyond `envelope` no event is tested. A pool is built once and
-    kept; `harness run` builds it, too.
+    surrogate crashes` that of one that all survive; `envelope` is at full throttle. A pool is built once and kept;
+    `harness run` builds it, too.
     """
     campaign = harness.load_campaign(campaign_file, [*options.of_scenario(scenario), *overrides])
     with progress_bar() as bar:
