@@ -75,7 +75,7 @@ def write_comparison(folder: Path, stored: dict[str, Any], runs: Sequence[RunFol
 
 def write_comparison_of_sum(folder: Path, stored: dict[str, Any]) -> Path:
     """Write the page of a comparison in several scenarios: the sum, and the way to each one's own page."""
-    beside = [several.beside_row("", stored[side]["beside"], seen=stored[side]["n_crashes"] > 0) for side in "ab"]
+    beside = [several.beside_row("", stored[side], stored[side]["beside"]) for side in "ab"]
     scenarios = [
         (several.called(name), name, pair, several.ratio_words(pair), several.pair_words(pair["decision"], pair))
         for name, pair in stored["families"].items()

@@ -75,20 +75,24 @@ def _sum_rows(content: Mapping[str, Any], *, readings: bool) -> Iterator[Row]:
     else:
         yield Row("rate", what, f"< {number(hour['upper_bound'])} per hour", "no crash seen")
     softened = any(n_softened(family["before_event"]) for family in content["families"].values())
-    how = {"seen": seen, "from_below": from_below, "softened": softened}
-    yield beside_row("× competent driver", content["beside"], **how)
+    how = {"from_below": from_below, "softened": softened}
+    yield beside_row("× competent driver", content, content["beside"], **how)
     for reading in content["readings"] if readings else ():
-        yield beside_row(f"× {reading['reference']}", reading, **how)
+        yield beside_row(f"× {reading['reference']}", content, reading, **how)
 
 
 def beside_row(
-    name: str, beside: Mapping[str, Any], *, seen: bool, from_below: bool = False, softened: bool = False
-) -> Row:
-    """The rate beside a reading of that driver, where crashes were ``seen`` or none; see `ratio_texts`."""
+    name: str, content: Mapping[str, Any], beside: Mapping[str, Any], *, from_below: bool = False,
+    softened: bool = False,
+) -> Row:  # fmt: skip
+    """The rate of a sum ``beside`` a reading of that driver, where crashes were seen or none; see `ratio_texts`."""
     if beside["ratio"] is None:
         return Row("ratio", name, "no ratio", "", "such a driver never crashes here")
-    reading, ends = (beside if seen else {**beside, "ratio": 0.0}), beside["over_assumed"]
-    over = "" if ends is None or ends[0] == ends[1] else f"{ratio(ends[0])} to {ratio(ends[1])} over assumed ranges"
+    reading, ends = (beside if content["n_crashes"] else {**beside, "ratio": 0.0}), beside["over_assumed"]
+    # How a vehicle that acts before the event moves with who does not look is not known.
+    assumed = [AssumedOfRate(**each) for family in content["families"].values() if (each := family.get("assumed"))]
+    moved = "assumed ranges" if any(map(looking_words, assumed)) else "exposures"
+    over = "" if ends is None or ends[0] == ends[1] else f"{ratio(ends[0])} to {ratio(ends[1])} over {moved}"
     if (limits := beside.get("limits_over_assumed")) is not None:
         most = "no limit" if limits[1] is None else ratio(limits[1])
         over = f"limits {ratio(limits[0])} to {most} over exposures"
@@ -97,8 +101,7 @@ def beside_row(
 
 def family_rows(content: Mapping[str, Any]) -> Iterator[tuple[str, ...]]:
     """A row each: key, name, share of the rate, crashes per hour and ratio with their intervals, how hard."""
-    order = sorted(content["families"].items(), key=lambda item: -(item[1]["rate_per_hour"] or 0.0))
-    for name, family in order:
+    for name, family in sorted(content["families"].items(), key=lambda item: -(item[1]["rate_per_hour"] or 0.0)):
         per_hour, part, beside = family["rate_per_hour"], "0 %", "–"
         rate = f"< {number(family['upper_bound'])}"
         if family["n_crashes"]:
@@ -188,18 +191,18 @@ def between(low: float, high: float | None, rate: float) -> str:
 
 def _scope(content: Mapping[str, Any]) -> str:
     """How far the interval goes, and why the tests ended."""
-    ended, target = words.ended_words(content["stopped_by"], content["decision"]), content["asked_rhw"]
-    if content["stopped_by"] == "rhw" and (rhw := content["per_hour"]["rhw"] or math.inf) > 1.005 * target:
+    stopped, target = content["stopped_by"], content["asked_rhw"]
+    ended = words.ended_words(stopped, content.get("ran", content)["decision"])
+    if stopped == "rhw" and (rhw := content["per_hour"]["rhw"] or math.inf) > 1.005 * target:
         here = words.reached_words(rhw, share(rhw)).removeprefix(", at ")
         narrower = "" if content["counts_in_interval"] else ": to narrow it, run anew with these settings"
         ended += f" as it was run; here {here}{narrower}"
-    if content["stopped_by"] == "accept" and content["decision"] is None:
+    if stopped == "accept" and content["decision"] is None:
         ended += f" ({content['ran']['decision']['verdict']}) at the exposures of the run"
-    by_precision = target is not None and content["decision"] is None
-    if content["stopped_by"] not in ("rhw", "accept", "below_reference") and by_precision:
+    if target is not None and content["decision"] is None and stopped not in ("rhw", "accept", "below_reference"):
         rhw = content["per_hour"]["rhw"]
         ended += f"{'' if rhw is None else words.reached_words(rhw, share(rhw))} (asked: ± {share(target)})"
-    if content["stopped_by"] == "episodes" and (target is not None or content["decision"] is not None):
+    if stopped == "episodes" and (target is not None or content["decision"] is not None):
         further = (rhw / target) ** 2 if target and (rhw := content["per_hour"]["rhw"]) else math.inf
         ended += words.go_on(content["n_episodes"], content["n_crashes"], content["decision"], further)
     counted = ", that of the sum also of counted events," if content["counts_in_interval"] else ""
@@ -261,8 +264,7 @@ def deciding_words(content: Mapping[str, Any], s_per_pair: float | None = None) 
     decision = content["decision"]
     if decision["verdict"] != "open" or content.get("ended") == "sum":
         return None
-    doubted = decision["n_milder"] or decision["n_differing"]
-    if decision["margin"] is not None and doubted:  # more pairs would not mend that
+    if decision["margin"] is not None and (decision["n_milder"] or decision["n_differing"]):  # no pairs mend that
         return None
     if not content["n_only_a"] + content["n_only_b"]:
         return "in no pair of tests did only one crash"
@@ -282,10 +284,7 @@ def deciding_words(content: Mapping[str, Any], s_per_pair: float | None = None) 
 def pair_asked(content: Mapping[str, Any]) -> Mapping[str, Any]:
     """What lies between A and B under the statement that the comparison (``compare.json``) was asked for."""
     given_library = content.get("asked") == LIBRARY_STATEMENT  # of one scenario
-    asked: Mapping[str, Any] = content
-    if given_library and not content["conditional"].get("refuted"):
-        asked = content["conditional"]
-    return asked
+    return content["conditional"] if given_library and not content["conditional"].get("refuted") else content
 
 
 def rates_of(side: Mapping[str, Any]) -> dict[str, Any]:

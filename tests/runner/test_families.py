@@ -183,6 +183,9 @@ def test_a_verdict_is_of_the_exposures_that_it_was_reached_with(asked, told, tmp
     other = estimate_families(run.folder, {"lead_brakes": 1e-6})
     assert other["decision"] is None
     assert "stopped: verdict reached (rejected) at the exposures of the run" in " ".join(repr(other).split())
+    ran = {"decision": {**verdict, "verdict": "undecided", "low": 0.0, "high": 0.0, "n_milder": 1}}
+    held_back = " ".join(" ".join(hour_lines({**other, "ran": ran})).split())
+    assert "stopped: rate below the limit (undecided) at the exposures of the run" in held_back
     write_sealed(run.folder / "families.json", dict(other))  # with its own the verdict is there again
     stored = json.loads((run.folder / "families.json").read_text())
     shipped = run.content["families"]["lead_brakes"]["exposure"]["per_hour"]
@@ -386,6 +389,15 @@ def test_a_verdict_that_assumed_numbers_may_turn_says_so(run, times, warned):
     assert f"turn this verdict: × {shown_ratio(low)} to {shown_ratio(2.0 * high)} over" in told
     own = {**run.content, "decision": {**verdict, "verdict": "undecided"}}
     assert "may turn" not in " ".join(hour_lines(own))
+
+
+def test_ranges_without_who_does_not_look_are_over_exposures(run):
+    """As where the vehicle acts before the cut-in: what moves with them is not known then."""
+    families = run.content["families"]
+    acts = {**run.content, "families": {**families, "cut_in": {**families["cut_in"], "assumed": None}}}
+    for content, told in ((run.content, "over assumed ranges"), (acts, "over exposures")):
+        (row,) = (line for line in hour_lines(content) if "× competent driver" in line)
+        assert row.endswith(told)
 
 
 def test_a_reading_of_the_regulation_that_turns_the_answer_is_said(run):
