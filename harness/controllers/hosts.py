@@ -90,12 +90,21 @@ def cause_of(error: BaseException) -> str:
     return (line if len(line) <= LONGEST_CAUSE else f"{line[:LONGEST_CAUSE]} …") + _place_of(error)
 
 
-def _place_of(error: BaseException) -> str:
+def _place_of(error: BaseException, *, own_files_alone: bool = False) -> str:
     """`` (my_av.py:12)``: the last line of the user's code on the way to an error; empty where there is none."""
     places = [(frame.f_code.co_filename, line) for frame, line in walk_tb(error.__traceback__)]
     theirs = [place for place in places if not place[0].startswith((*NOT_THE_USERS, "<"))]
-    own_files = [place for place in theirs if place[0].endswith(".py") and "site-packages" not in place[0]] or theirs
+    own_files = [place for place in theirs if place[0].endswith(".py") and "site-packages" not in place[0]]
+    own_files = own_files or ([] if own_files_alone else theirs)
     return f" ({Path(own_files[-1][0]).name}:{own_files[-1][1]})" if own_files else ""
+
+
+def require_ours(error: Exception) -> None:
+    """Refuse (`CampaignError`) a vehicle whose code has raised an error between its calls, as a signal's handler may."""
+    if _place_of(error, own_files_alone=True):
+        found = f"a vehicle that raises between its calls: {cause_of(error)}"
+        mend = "Leave no timer, handler of a signal or replaced function behind when a call returns."
+        raise CampaignError("av.controller", found, "code that runs in its own calls alone", mend) from error
 
 
 class StepTimeoutError(BaseException):
@@ -168,7 +177,9 @@ class Guard:
                 os._exit(0)
 
     def require_untouched(self) -> None:
-        """Refuse (`CampaignError`) a vehicle that has replaced what the harness calls, or lets it open no file."""
+        """Refuse (`CampaignError`) a vehicle that has replaced what the harness calls, or lets it open no file; end its timers."""
+        for timer in (signal.ITIMER_REAL, signal.ITIMER_VIRTUAL, signal.ITIMER_PROF):
+            signal.setitimer(timer, 0.0)
         if replaced := self._others.restored():
             more = f" and {len(replaced) - 3} more" if len(replaced) > 3 else ""
             found = f"a vehicle that has replaced {', '.join(replaced[:3])}{more}, which the harness calls, too"

@@ -18,7 +18,7 @@ from typing import Any
 
 WATCHED = (
     *("builtins", "functools", "hashlib", "io", "math", "json", "os", "pickle", "signal", "struct", "time", "zlib"),
-    *("numpy", "pyarrow", "pyarrow.compute", "pyarrow.parquet"),
+    *("pathlib", "numpy", "pyarrow", "pyarrow.compute", "pyarrow.parquet"),
 )
 OURS = "harness", "numba", "llvmlite", "numpy"
 """Packages of which no module may be replaced."""
@@ -64,7 +64,8 @@ class OtherModules:
         watched = [name for name in self._loaded if name in WATCHED or name.partition(".")[0] == OURS[0]]
         places: dict[str, Any] = {name: self._loaded[name] for name in watched}
         types = [cls for module in places.values() for cls in vars(module).values() if isinstance(cls, type)]
-        places |= {f"{cls.__module__}.{cls.__qualname__}": cls for cls in types if cls.__module__[:8] == "harness."}
+        ours = [cls for cls in types if cls.__module__.partition(".")[0] in (OURS[0], "pathlib")]
+        places |= {f"{cls.__module__}.{cls.__qualname__}": cls for cls in ours}
         self._kept = {name: (place, _functions_and_numbers(vars(place))) for name, place in places.items()}
 
     def restored(self) -> list[str]:

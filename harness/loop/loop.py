@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from harness.compiled import unboxed
-from harness.controllers.hosts import ControllerHost
+from harness.controllers.hosts import ControllerHost, require_ours
 from harness.controllers.protocol import BatchObservation
 from harness.errors import CampaignError, WorldDisagreementError
 from harness.loop.cells import EPISODE_DTYPE, KernelState, PrescribedEvents, idle_cells
@@ -115,7 +115,7 @@ class EpisodeLoop:
         """Run the campaign's tests ``first_episode … first_episode + n − 1`` with this traffic (n tests).
 
         Raises `WorldDisagreementError`: the world did something else than it was told. Raises `CampaignError`: the
-        vehicle has replaced functions that the harness calls, or has changed the simulation.
+        vehicle has replaced functions that the harness calls, has changed the simulation, or raises between its calls.
         """
         n = len(traffic)
         traced = hash_of_index(self._scenario.seed, first_episode + np.arange(n)) < self._keep.trace_share
@@ -142,7 +142,10 @@ class EpisodeLoop:
                 given += placed
         except Exception as error:
             lent = sorted(self._world.lent) if isinstance(error, WorldDisagreementError | RuntimeError) else []
-            if self._av is None or not (lent or type(error).__module__ == "libsumo.libsumo"):
+            if self._av is None:
+                raise
+            if not (lent or type(error).__module__ == "libsumo.libsumo"):
+                require_ours(error)
                 raise
             found = f"a vehicle that has changed the simulation that it is tested in ({', '.join(lent) or error})"
             mend = "Use the traci that is handed in (docs/controllers.md), not the module."

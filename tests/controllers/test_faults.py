@@ -232,6 +232,7 @@ def test_check_refuses_what_run_refuses_and_makes_nothing_but_controllers(av, wh
         "harness.loop.loop.judge",
         "io.BytesIO",
         "hashlib.sha256",
+        "pathlib.Path.read_bytes",
     ],
 )
 def test_one_that_replaces_what_the_harness_calls_is_named(what, at, tmp_path, capsys):
@@ -240,6 +241,11 @@ def test_one_that_replaces_what_the_harness_calls_is_named(what, at, tmp_path, c
     assert err.startswith("error: av.controller\n")
     assert f"a vehicle that has replaced {what}, which the harness calls, too" in err
     assert (tmp_path / "run").exists() == (at == "step")
+
+
+def test_one_that_leaves_a_timer_whose_handler_raises_is_named(tmp_path, capsys):
+    assert _run(tmp_path, _of("LeavesTimer")) == EXIT_BAD_INPUT
+    assert "found:    a vehicle that raises between its calls: OSError: too late" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
