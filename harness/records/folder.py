@@ -281,6 +281,7 @@ class StoredManifest(BaseModel):
     unmet: list[dict[str, Any]] = []
     wall_time_s: float | None = None
     distance_per_test_m: float | None = None
+    tests_per_hour: float | None = None
     repeated: Repeated | None = None
     before: dict[str, Part] = {}
 

@@ -250,6 +250,8 @@ def _scope(campaign: Campaign, manifest: Mapping[str, Any], estimates: Estimates
     elif stopped_by in ("rhw", "below_reference") and campaign.testing.shells.statement != ASSUMPTION_FREE:
         ended += f", given the {campaign.testing.shells.statement}"
     test = family_named(campaign.scenario).words.test
+    if (times := manifest.get("tests_per_hour")) is not None:
+        test += f" (× {number(times, 2)} = crashes per hour)"
     return f"a test is {test}; {scope_words(best.confidence, ended)}"
 
 

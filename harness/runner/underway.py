@@ -96,8 +96,11 @@ class Underway:
     def keep_design(self) -> None:
         """Write the strata, which estimates need; refuse a folder whose strata are of another pool."""
         kept.require_same_pool(self.run.folder, self.run.source)
-        if self.run.source.design is not None:
-            write_sealed(self.run.folder / SHELLS, STORED_DESIGN.dump_python(self.run.source.design, mode="json"))
+        if (design := self.run.source.design) is not None:
+            write_sealed(self.run.folder / SHELLS, STORED_DESIGN.dump_python(design, mode="json"))
+            resolved = self.run.resolved
+            per_hour = resolved.family.exposure(resolved.environment, resolved.parameters).per_hour
+            self.run = self.run.noting(tests_per_hour=per_hour / design.p_counted)
 
     def drive_before_tests(self) -> None:
         """Drive milder events, where the family has some, and baseline runs, where tests follow from them."""

@@ -86,6 +86,10 @@ def test_the_answer_is_the_sum_over_families_of_what_their_runs_say(run):
     # Of an event that happens for certain no test knows how far apart two are.
     assert read_manifest(run.folder / "cut_in")["distance_per_test_m"] > 100.0
     assert read_manifest(run.folder / "lead_brakes")["distance_per_test_m"] is None
+    for name, part in told["families"].items():  # the factor that an answer of one scenario gives
+        per_test = harness.estimate(run.folder / name)["estimates"]["shells"]["crash_rate"]
+        times = read_manifest(run.folder / name)["tests_per_hour"]
+        assert times * per_test == pytest.approx(part["rate_per_hour"], rel=1e-9)
 
 
 def test_workers_and_interruptions_change_no_bit(run, tmp_path):
