@@ -177,7 +177,7 @@ class Guard:
                 os._exit(0)
 
     def require_untouched(self) -> None:
-        """Refuse (`CampaignError`) a vehicle that has replaced what the harness calls, or lets it open no file; end its timers."""
+        """End timers; refuse (`CampaignError`) a vehicle that has replaced what the harness calls, or lets it open no file."""
         for timer in (signal.ITIMER_REAL, signal.ITIMER_VIRTUAL, signal.ITIMER_PROF):
             signal.setitimer(timer, 0.0)
         if replaced := self._others.restored():
