@@ -100,7 +100,7 @@ def _place_of(error: BaseException, *, own_files_alone: bool = False) -> str:
 
 
 def require_ours(error: Exception) -> None:
-    """Refuse (`CampaignError`) a vehicle whose code has raised an error between its calls, as a signal's handler may."""
+    """Refuse (`CampaignError`) a vehicle whose code has raised an error between its calls, as by a signal's handler."""
     if _place_of(error, own_files_alone=True):
         found = f"a vehicle that raises between its calls: {cause_of(error)}"
         mend = "Leave no timer, handler of a signal or replaced function behind when a call returns."
@@ -177,7 +177,7 @@ class Guard:
                 os._exit(0)
 
     def require_untouched(self) -> None:
-        """End timers; refuse (`CampaignError`) a vehicle that has replaced what the harness calls, or lets it open no file."""
+        """End timers; refuse (`CampaignError`) a vehicle that has replaced what the harness calls, or opens no file."""
         for timer in (signal.ITIMER_REAL, signal.ITIMER_VIRTUAL, signal.ITIMER_PROF):
             signal.setitimer(timer, 0.0)
         if replaced := self._others.restored():
