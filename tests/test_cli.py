@@ -282,8 +282,8 @@ def test_a_reader_that_has_gone_does_not_change_the_exit_code(monkeypatch):
 def test_a_run_without_a_folder_gets_a_new_one_and_resumes_the_last(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     campaign = Campaign(name="mine")
-    for last, new in (("mine", "mine"), ("mine", "mine-2"), ("mine-2", "mine-3")):
-        assert [run_folder(campaign, resume=resume).name for resume in (True, False)] == [last, new]
+    for last, new in (("mine-all", "mine-all"), ("mine-all", "mine-all-2"), ("mine-all-2", "mine-all-3")):
+        assert [run_folder(campaign, "all", resume=resume).name for resume in (True, False)] == [last, new]
         Path("runs", new).mkdir(parents=True)
 
 

@@ -225,6 +225,10 @@ REFUSED = (
     ),
     # -- several scenarios --
     Combination(
+        "scenario", lambda c, _: c.scenarios is not None and c.scenario != DEFAULT_FAMILY,
+        "{scenario}, beside scenarios", "one of both", "Delete one of both keys.",
+    ),
+    Combination(
         "scenarios", lambda c, _: c.scenarios is not None and len(set(c.scenarios)) < len(c.scenarios),
         "a scenario that is named twice", "each once", "Delete one of both.",
     ),

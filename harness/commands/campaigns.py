@@ -130,7 +130,7 @@ def run(
     if resume and ran and any((campaign_file.parent / name).is_file() for name in ("manifest.json", FAMILIES)):
         folder = folder or campaign_file.parent
     if folder is None:
-        folder = options.run_folder(campaign, resume=resume)
+        folder = options.run_folder(campaign, scenario, resume=resume)
         say(f"into {folder}", err=True)
     if resume and not holds_tests(folder):
         say(f"note: nothing to resume in {folder}: starts anew", err=True)
@@ -236,7 +236,9 @@ def compare(
     if junit is not None and margin is None:
         say("note: without --margin the JUnit file says only whether it came to an end, whichever is worse", err=True)
     if folder is None:
-        folder = options.RUNS / f"{a.name}-{re.sub('[^A-Za-z0-9_.-]+', '-', name_b)}"
+        folder = options.RUNS / f"{a.name}-{re.sub('[^A-Za-z0-9_.-]+', '-', name_b)}{options.in_name(scenario)}"
+    if a.av == b.av:
+        say("note: A and B are the same vehicle", err=True)
     rhw = a.stop.rhw if any(parse_override(each).path == ("stop", "rhw") for each in overrides) else None
     with error_in(junit, " and ".join(labels)), prints_kept_in(folder), progress_bar() as bar:
         comparison = harness.compare(

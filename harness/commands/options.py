@@ -81,14 +81,15 @@ def _exposures(ctx: click.Context, parameter: click.Parameter, texts: tuple[str,
 
     per_hour = {}
     for text in texts:
-        name, _, value = text.partition("=")
-        family_named(name, where := f"--exposure {text}")
+        name, equals, value = text.partition("=")
+        if equals:
+            family_named(name, f"--exposure {text}")
         try:
             per_hour[name] = click.FloatRange(*EXPOSURES)(value, parameter, ctx)
         except click.BadParameter:
-            expected = "events per hour of driving, {:g} to {:g}".format(*EXPOSURES)
-            mend = f"Write --exposure {name}=0.1, one each; or leave it out of --scenario."
-            raise HarnessError(where, f"'{value}'", expected, mend) from None
+            expected = "a scenario and its events per hour of driving, {:g} to {:g}".format(*EXPOSURES)
+            mend = "Write --exposure lead_brakes=0.1, once for each; or leave a scenario out of --scenario."
+            raise HarnessError(f"--exposure {text}", f"'{value or text}'", expected, mend) from None
     return per_hour
 
 
@@ -119,7 +120,7 @@ def of_scenario(text: str | None) -> list[str]:
         family_named(name, f"--scenario {text}", more=("all",))
     if len(names) == 1:
         return [f"scenario={names[0]}", "scenarios=null"]
-    return [f"scenarios=[{', '.join(names)}]"]
+    return [f"scenario={R157[0]}", f"scenarios=[{', '.join(names)}]"]
 
 
 def progress_bar() -> Progress:
@@ -166,10 +167,15 @@ def accepting(limit: str) -> list[str]:
     return [f"accept.{keys[0]}={value}", f"accept.{keys[1]}=null"]
 
 
-def run_folder(campaign: Campaign, *, resume: bool) -> Path:
+def in_name(scenario: str | None) -> str:
+    """What ``--scenario`` adds to the name of a folder."""
+    return "" if scenario is None else f"-{scenario.replace(',', '-').replace(' ', '')}"
+
+
+def run_folder(campaign: Campaign, scenario: str | None, *, resume: bool) -> Path:
     """``runs/NAME``, or the first of ``runs/NAME-2``, ``-3``, … that is free; to resume, the last that exists."""
-    numbered = chain([RUNS / campaign.name], (RUNS / f"{campaign.name}-{number}" for number in count(2)))
-    existing = list(takewhile(Path.exists, numbered))
+    name = campaign.name + in_name(scenario)
+    existing = list(takewhile(Path.exists, chain([RUNS / name], (RUNS / f"{name}-{number}" for number in count(2)))))
     if resume and existing:
         return existing[-1]
-    return RUNS / (f"{campaign.name}-{len(existing) + 1}" if existing else campaign.name)
+    return RUNS / (f"{name}-{len(existing) + 1}" if existing else name)

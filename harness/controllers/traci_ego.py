@@ -28,6 +28,7 @@ OTHERS = "LV", "BV", "SV"
 SPEED_MPS = 25.0
 FAILS = "fails when it is tried before a cut-in"
 DRIVES = "setSpeed", "slowDown", "setAcceleration"
+COMMANDS_NONE = "commands no vehicle before a cut-in"
 NEVER_DRIVES = "gives no speed or acceleration, in ten seconds in which a car cuts in, to"
 
 
@@ -65,9 +66,9 @@ def script_maker(av: AutomatedVehicle, guard: Guard) -> Callable[[], ScriptContr
 def _unusable(name: str, wrong: str, ego: str | None) -> CampaignError:
     """The error of a script with which something is ``wrong``, and how to mend it."""
     expected, mend = "a script that commands one vehicle", "Name its vehicle: --set av.traci_style.ego=NAME."
-    if wrong.startswith(NEVER_DRIVES):
+    if wrong.startswith((NEVER_DRIVES, COMMANDS_NONE)):
         mend = "A test is one run of it from its first line: leave out steps that only wait. If it drives later, "
-        mend += f"--set av.traci_style.ego={ego}."
+        mend += f"--set av.traci_style.ego={ego or 'NAME'}."
     if wrong.startswith(FAILS):
         expected = "a script that gets through a cut-in"
         mend, line = "Fix the script in that line.", re.search(r":(\d+)\)", wrong)
@@ -180,7 +181,7 @@ def _found(script: TraciScript) -> tuple[str | None, str, _Tried]:
         if named == [name] and not failed:
             return name, "" if tried.drives else f"{NEVER_DRIVES} {name}", tried
     why = next(filter(None, wrong), "")
-    return None, f"{FAILS}: {why}" if why else "commands no vehicle before a cut-in", tried
+    return None, f"{FAILS}: {why}" if why else COMMANDS_NONE, tried
 
 
 def _commanded(script: TraciScript, ego: str) -> tuple[_Tried, str]:

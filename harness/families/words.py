@@ -18,13 +18,13 @@ ELSEWHERE = "in other trajectories than this traffic’s"
 class Words(NamedTuple):
     """Nouns and phrases of pages and terminals.
 
-    ``called`` names the scenario, ``test`` a test, ``event`` and ``events`` what happens in it, ``since`` the moment
-    from which times are counted, ``such`` the driving of a rate per million km, ``same`` events that two vehicles meet
-    alike. ``kicker`` says what pages are about, ``none`` that nothing happened, ``strikes`` what the AV does in a
-    crash, ``who`` the vehicles are, ``unlikely`` why probabilities of events do not add up to 1. ``shows`` and
-    ``happens`` are a vehicle and what it does, at the onset and at the event; equal where these are one. ``tests`` says
-    what tests are like, by whether events show themselves, and ``rests`` what a rate scales with, by the traffic (None
-    if it is not known) and the level of lane changing. ``late`` is what one that does not look waits for, and
+    ``called`` names the scenario, ``test`` what rates are per, ``event`` and ``events`` what happens in it, ``since``
+    the moment from which times are counted, ``such`` the driving of a rate per million km, ``same`` events that two
+    vehicles meet alike. ``kicker`` says what pages are about, ``none`` that nothing happened, ``strikes`` what the AV
+    does in a crash, ``who`` the vehicles are, ``unlikely`` why probabilities of events do not add up to 1. ``shows``
+    and ``happens`` are a vehicle and what it does, at the onset and at the event; equal where these are one. ``tests``
+    says what tests are like, by whether events show themselves, and ``rests`` what a rate scales with, by the traffic
+    (None if it is not known) and the level of lane changing. ``late`` is what one that does not look waits for, and
     what shows it earlier, to a controller and to a script; empty where nothing does.
     """
 
@@ -50,7 +50,7 @@ class Words(NamedTuple):
 def words_of(*, event: str, of: str, **own: Any) -> Words:
     """General words for an event ``of`` a vehicle; a family replaces some by its ``own``."""
     defaults = {
-        "called": event, "test": f"one {event}", "events": f"{event}s", "since": f"the {event}", "such": "",
+        "called": event, "test": event, "events": f"{event}s", "since": f"the {event}", "such": "",
         "same": f"{event}s",
         "kicker": f"How often an automated vehicle (AV) crashes when there is a {event}, on a motorway",
         "none": f"There was no {event}.", "strikes": "", "who": f"{of} the one that the {event} is about",

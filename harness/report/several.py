@@ -92,7 +92,8 @@ def beside_row(
     # How a vehicle that acts before the event moves with who does not look is not known.
     assumed = [AssumedOfRate(**each) for family in content["families"].values() if (each := family.get("assumed"))]
     moved = "assumed ranges" if any(map(looking_words, assumed)) else "exposures"
-    over = "" if ends is None or ends[0] == ends[1] else f"{ratio(ends[0])} to {ratio(ends[1])} over {moved}"
+    low, high = ("", "") if ends is None else map(ratio, ends)
+    over = "" if low == high else f"{low} to {high} over {moved}"
     if (limits := beside.get("limits_over_assumed")) is not None:
         most = "no limit" if limits[1] is None else ratio(limits[1])
         over = f"limits {ratio(limits[0])} to {most} over exposures"
@@ -110,7 +111,7 @@ def family_rows(content: Mapping[str, Any]) -> Iterator[tuple[str, ...]]:
             far = high is not None and high >= FAR_APART * low
             rate = f"{number(per_hour)} (≥ {number(low)})" if high is None else interval(low, high, per_hour)
             if far:  # what is known is a limit
-                rate = f"< {number(high)} ({number(per_hour)})"
+                rate = f"< {number(high)} (est. {number(per_hour)})"
             if (times := family["ratio"]) is not None:
                 least, most = number(family["ratio_low"], 2), number(family["ratio_high"], 2)
                 ends = f"≥ {least}" if family["ratio_high"] is None else f"{least}–{most}"
@@ -169,16 +170,18 @@ def exposures(content: Mapping[str, Any]) -> str:
         exposure = family["exposure"]
         is_given = exposure["low"] == exposure["high"] and exposure["source"] != "assumed"
         kind = "counted" if exposure["counted"] else "given" if is_given else "assumed"
-        phrases.setdefault(kind, []).append(f"{called(name)} {plain(float(format(exposure['per_hour'], '.2g')))}")
-        for mark in (EXCLUDED, ELSEWHERE):
-            phrases[kind][-1] += f" ({mark})" * (mark in exposure["source"])
+        per_hour, low, high = (plain(float(format(exposure[key], ".2g"))) for key in ("per_hour", "low", "high"))
+        notes = [f"{low}–{high}"] if exposure["counted"] else []
+        notes += [mark for mark in (EXCLUDED, ELSEWHERE) if mark in exposure["source"]]
         assumed = family["n_crashes"] and family.get("assumed")
         if assumed and (others := looking_words(moved := AssumedOfRate(**assumed))):
-            phrases[kind][-1] += f" (crashes up to × {number(moved.most, 2)} if {others})"
+            notes.append(f"crashes × {number(moved.most, 2)} if {others}")
+        phrases.setdefault(kind, []).append(f"{called(name)} {per_hour}" + (f" ({'; '.join(notes)})" if notes else ""))
     parts = [f"{kind}: {', '.join(scenarios)}" for kind, scenarios in phrases.items()]
     more = "other numbers: harness sensitivity"
-    if (ends := content["per_hour"].get("over_assumed")) is not None and ends[0] < ends[1]:  # older runs have none
-        more = f"rate over assumed ranges {' to '.join(number(end, 2) for end in ends)}"
+    low, high = (number(each, 2) for each in content["per_hour"].get("over_assumed") or (0.0, 0.0))  # older runs: none
+    if low != high:
+        more = f"rate over assumed ranges {low} to {high}"
     return f"events per hour, {'; '.join([*parts, more])}"
 
 
@@ -244,7 +247,9 @@ def pair_warnings(content: Mapping[str, Any]) -> Iterator[str]:
     sides: dict[str, list[str]] = {}
     for name in "AB":
         side = content[name.lower()]
-        for text in sum_warnings(side) if "families" in content else _warnings_of_side(content, side):
+        for text in (
+            sum_warnings({**side, "readings": ()}) if "families" in content else _warnings_of_side(content, side)
+        ):
             sides.setdefault(text, []).append(name)
     yield from (f"{' and '.join(names)}{',' if 'families' in content else ':'} {text}" for text, names in sides.items())
     if where := content.get("unseen"):

@@ -251,8 +251,8 @@ def _scope(campaign: Campaign, manifest: Mapping[str, Any], estimates: Estimates
         ended += f", given the {campaign.testing.shells.statement}"
     test = family_named(campaign.scenario).words.test
     if (times := manifest.get("tests_per_hour")) is not None:
-        test += f" (× {number(times, 2)} = crashes per hour)"
-    return f"a test is {test}; {scope_words(best.confidence, ended)}"
+        test += f" (× {number(times, 2)} = per hour)"
+    return f"per test is per {test}; {scope_words(best.confidence, ended)}"
 
 
 def go_on(n: int, n_crashes: int = 0, decision: Mapping[str, Any] | None = None, further: float = 2.0) -> str:

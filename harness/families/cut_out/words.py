@@ -8,7 +8,7 @@ from harness.families.words import Shown
 WORDS = words_of_following(
     called="cut-out",
     event="cut-out",
-    test="one cut-out, most often a harmless one",
+    test="cut-out, most often a harmless one",
     since="the lane was clear",
     kicker="How often an automated vehicle (AV) collides with a slower vehicle (SV) that the one ahead (LV) reveals "
     "when it leaves the lane, on a motorway",

@@ -25,7 +25,7 @@ STAND_INS = MappingProxyType(
 def words_of_following(*, event: str, then: str, depend: str, strikes: str, **own: Any) -> Words:
     """Words of pages; ``then`` is what the vehicle ahead does, ``depend`` the assumed numbers that rates depend on."""
     return Words(
-        test=own.pop("test", f"one {event} as in this traffic"),
+        test=own.pop("test", f"{event} as in this traffic"),
         event=event,
         events=f"{event}s",
         such=" following",

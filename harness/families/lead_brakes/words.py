@@ -10,7 +10,7 @@ from harness.families.words import Shown
 WORDS = words_of_following(
     called="lead brakes",
     event="braking",
-    test="one braking of the vehicle ahead by 3 m/s² or more",
+    test="braking of the vehicle ahead by 3 m/s² or more",
     since="the onset",
     kicker="How often an automated vehicle (AV) collides with the vehicle ahead (LV) when that brakes, on a motorway",
     same="vehicles ahead that brake",
