@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 from harness.campaign.campaign import Campaign, Command, Use, refusal
-from harness.controllers.find import require_controller, script_step_s, source_of_own
+from harness.controllers.find import TriedScript, require_controller, source_of_own, tried_script
 from harness.errors import CampaignError
 from harness.estimators.one_pass import accumulator, headline_of
 from harness.families import family_named
@@ -30,8 +30,8 @@ class Resolved:
     built-in AV, else (0,); ``surrogates`` (J,) are the drivers that challenges are computed for, and ``challenge`` how
     they are, with the hashes of files for a function or surrogates of the user's own. ``content_hash`` is of all that
     changes an episode's bits, the environment's numbers included; ``controller_sha256`` of the source of the AV's
-    controller, None where there is none, or before `require_ready`; ``script`` is the time between two calls of a TraCI
-    script (s), else 0.
+    controller, None where there is none, or before `require_ready`; ``script`` is what a TraCI script did when it was
+    tried.
     """
 
     campaign: Campaign
@@ -42,7 +42,7 @@ class Resolved:
     challenge: str
     content_hash: str
     controller_sha256: str | None = None
-    script: float = 0.0
+    script: TriedScript | None = None
 
     @property
     def family(self) -> Family:
@@ -82,7 +82,7 @@ def require_ready(campaign: Campaign, command: Command = "run") -> Resolved:
         from harness.worlds.program import require_private  # noqa: PLC0415 - imports traci
 
         require_private(campaign.av.traci)
-    script = script_step_s(campaign.av)
+    script = tried_script(campaign.av)
     resolved = replace(resolve(campaign, command), controller_sha256=controller_sha256, script=script)
     accumulator(headline_of(campaign))  # fails if an estimator of the user's own cannot be made
     if campaign.sampling.strata:

@@ -132,7 +132,10 @@ def test_an_option_without_its_value_is_told_by_its_command(capsys):
         ("run --accept 50%", "expected: crashes per test (3e-7), or a driver (r157-cc, 0.5*r157-cc)"),
         ("run --accept r157cc", "fix:      Did you mean 'r157-cc'?"),
         ("run --accept -1", "fix:      Correct it; the key means: crashes per test"),
-        ("run --exposure lead_brakes=abc", "found:    'abc'\n  expected: a scenario and its events per hour of driving, 1e-09 to"),
+        (
+            "run --exposure lead_brakes=abc",
+            "found:    'abc'\n  expected: a scenario and its events per hour of driving, 1e-09 to",
+        ),
         ("run --independent x", "found:    Invalid value for '--independent': 'x' is not a whole number"),
         ("run --scenario all --exposure leadbrakes=1", "fix:      Write --exposure lead_brakes=1."),
         ("run --set seed=2 --exposure cut_out=1", "Add --scenario all"),

@@ -18,7 +18,7 @@ from operator import methodcaller
 from pathlib import Path
 from threading import RLock
 from types import ModuleType, SimpleNamespace
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 from harness.campaign.python_files import (
     FromSource,
@@ -297,31 +297,37 @@ def require_controller(av: AutomatedVehicle) -> str | None:
         raise CampaignError(error.where, error.found, "a controller that can be made", error.mend) from error
 
 
-LONGEST_IDLE_S = 1.0
-"""Steps in which a script need not look at a vehicle [assumed]."""
+class TriedScript(NamedTuple):
+    """What a TraCI script does when it is tried: for 15 s, in which a car cuts in, and then drives ahead.
+
+    ``step_s`` is the step that it asks for. It is ``idle_s``, looking at no vehicle, before it begins; and ``left_s``
+    is how long, with somebody ahead, it gives no command, so that SUMO's own model would drive.
+    """
+
+    step_s: float
+    idle_s: float
+    left_s: float
 
 
-def script_step_s(av: AutomatedVehicle) -> float:
-    """The step (s) that a TraCI script asks for when it is tried; 0 for any other controller."""
+def tried_script(av: AutomatedVehicle) -> TriedScript | None:
+    """What a TraCI script does; None of any other controller. What its type bounds is said once, on stderr."""
     if not is_script(name := str(av.controller)):
-        return 0.0
+        return None
     from harness.controllers.traci_ego import asked_for  # noqa: PLC0415 - few campaigns have one
 
-    (every, hardest, idle), bound = run_apart(av, asked_for, av), av.traci_style.decel_mps2
+    (every, hardest, idle, left), bound = run_apart(av, asked_for, av), av.traci_style.decel_mps2
     file = real_path(file_and_function(name)[0]).name
     if not every:
         note = "names no --step-length, nor does its .sumocfg: it is asked every 0.1 s, where SUMO would ask every 1 s"
         _tell_once(f"{file} {note}")
-    if (idle_s := idle * STEP_S * (every or 1)) > LONGEST_IDLE_S:
-        note = f"looks at no vehicle in the first {idle_s:.1f} s of a test, in which a car may cut in"
-        _tell_once(f"{file} {note}: a test is one run of it from its first line, so leave out steps that only wait")
     if math.isinf(hardest):
         note = "sets a speed mode in which no decel bounds its braking, and a test fails where it is beyond av.limits"
         _tell_once(f"{file} {note}; for a bound use mode 31, and --set av.traci_style.decel_mps2=8, say")
     elif hardest > bound and "decel_mps2" not in av.traci_style.model_fields_set:
         note = f"asks for harder braking than {bound:g} m/s², the decel of SUMO's default type, and gets that"
         _tell_once(f"{file} {note}; of another type: --set av.traci_style.decel_mps2=8, say")
-    return STEP_S * (every or 1)
+    step_s = STEP_S * (every or 1)
+    return TriedScript(step_s, idle * step_s, left * step_s)
 
 
 def _sources_of_made(av: AutomatedVehicle) -> str | None:

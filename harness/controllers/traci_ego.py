@@ -10,6 +10,7 @@ import re
 from collections.abc import Callable, Iterator
 from contextlib import closing, redirect_stdout
 from functools import partial
+from itertools import chain, islice
 from pathlib import Path
 
 import numpy as np
@@ -29,7 +30,7 @@ SPEED_MPS = 25.0
 FAILS = "fails when it is tried before a cut-in"
 DRIVES = "setSpeed", "slowDown", "setAcceleration"
 COMMANDS_NONE = "commands no vehicle before a cut-in"
-NEVER_DRIVES = "gives no speed or acceleration, in ten seconds in which a car cuts in, to"
+NEVER_DRIVES = "gives no speed or acceleration, in 15 s in which a car cuts in, to"
 
 
 def script_maker(av: AutomatedVehicle, guard: Guard) -> Callable[[], ScriptController]:
@@ -128,12 +129,14 @@ class _Tried(VehicleDomain):
     """Notes what a script does.
 
     Which vehicles it commands, whether it ``drives``, its ``hardest`` braking (m/s²) that its vehicle's type bounds,
-    infinite where a speed mode lets nothing bound it, and how many steps it is ``idle``, looking at no vehicle.
+    infinite where a speed mode lets nothing bound it, how many steps it is ``idle``, looking at no vehicle, and in how
+    many with somebody ahead no command holds: they are ``left`` to SUMO's own model.
     """
 
     def __init__(self, ego: str) -> None:
         super().__init__(SPEED_MPS, ego)
         self.commanded, self.hardest, self.drives = dict[str, None](), 0.0, False
+        self.left = 0
         self.idle, self._looks = -2, False  # the first step is seen at the start, the second after a step
         if isinstance(ego, _AnyName):
             self._seen = _Anybody(self._seen, ego)
@@ -141,6 +144,11 @@ class _Tried(VehicleDomain):
     getAccel, getDecel = staticmethod(lambda _: 2.6), staticmethod(lambda _: 4.5)  # of SUMO's default type
 
     def next_acceleration(self) -> float:
+        told = [*islice(self._plan, 1)]
+        own, others = self._own, (self._lv, self._bv)
+        ahead = any(other.lane == own.lane and other.position > own.position for other in others)
+        self.left += ahead and not told
+        self._plan = chain(told, self._plan)
         acceleration = super().next_acceleration()
         if math.isinf(self._decel) and acceleration < 0.0:  # no bound of its own
             self.hardest = max(self.hardest, -acceleration if self._speed_mode & DECEL else math.inf)
@@ -196,8 +204,8 @@ def _commanded(script: TraciScript, ego: str) -> tuple[_Tried, str]:
     return tried, ""
 
 
-def asked_for(av: AutomatedVehicle) -> tuple[int, float, int]:
-    """Steps of the harness in one that a script asks for, 0 if none; its hardest braking and idle steps (`_Tried`)."""
+def asked_for(av: AutomatedVehicle) -> tuple[int, float, int, int]:
+    """Steps of the harness in one that a script asks for, 0 if none; ``hardest``, ``idle`` and ``left`` of `_Tried`."""
     script, ego = TraciScript(str(av.controller), dict(av.parameters)), av.traci_style.ego
     tried = _Tried(ego or _AnyName(VEH_ID))
     controller = ScriptController(script, lambda *_: tried)
@@ -209,21 +217,23 @@ def asked_for(av: AutomatedVehicle) -> tuple[int, float, int]:
         else:
             answer, _ = guard.call(_commanded, script, ego, makes=True)
             tried = answer[0] if answer else tried
-    return controller.traci.every, tried.hardest, tried.idle
+    return controller.traci.every, tried.hardest, tried.idle, tried.left
 
 
-def _drive(controller: ScriptController, n_steps: int = 100) -> None:
-    """By default ten seconds, in which a car that is 10 m/s slower cuts in 12 m ahead."""
+def _drive(controller: ScriptController, n_steps: int = 150) -> None:
+    """For ten seconds, in which a car that is 10 m/s slower cuts in 12 m ahead; then five in which it is 40 m ahead."""
     controller.start(EpisodeStart(0, STEP_S, np.random.default_rng(0), SPEED_MPS))
     position = acceleration = 0.0
-    speed, bv_position, cut_in = SPEED_MPS, 60.0, False
+    speed, bv_position, bv_speed, cut_in = SPEED_MPS, 60.0, SPEED_MPS - 10.0, False
     for step in range(n_steps):
+        if step >= 100:
+            bv_position, bv_speed = position + VEHICLE_LENGTH_M + 40.0, speed
         gap = bv_position - VEHICLE_LENGTH_M - position
         cut_in = cut_in or gap < 12.0 or step > 60
-        ahead = (gap, 15.0) if cut_in and gap > -10.0 else (math.inf, math.nan)
-        bv, lv = Neighbour(bv_position, 15.0, 0 if cut_in else 1), Neighbour(bv_position + 50.0, 15.0, 1)
+        ahead = (gap, bv_speed) if cut_in and gap > -10.0 else (math.inf, math.nan)
+        bv, lv = Neighbour(bv_position, bv_speed, 0 if cut_in else 1), Neighbour(bv_position + 50.0, bv_speed, 1)
         own = STEP_S * step, position, speed, acceleration
         answer = controller.step(Observation(*own, *ahead, bv, lv, bv_overlaps=cut_in, set_speed_mps=SPEED_MPS))
         acceleration = min(max(answer, -10.0), 3.0)
         speed = max(0.0, speed + STEP_S * acceleration)
-        position, bv_position = position + STEP_S * speed, bv_position + STEP_S * 15.0
+        position, bv_position = position + STEP_S * speed, bv_position + STEP_S * bv_speed

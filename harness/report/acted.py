@@ -11,6 +11,8 @@ from harness.loop.cells import BRAKED_MPS2, FAR_BEHIND_S
 from harness.numbers import plain, tests
 
 NEVER_BRAKED = f"it never braked with {plain(BRAKED_MPS2)} m/s² or more (below 0): does it see the other vehicle?"
+LONGEST_S = 1.0
+"""Time that a script may do nothing without a word [assumed]."""
 BRAKES_BEFORE = "in {} it braked with nobody ahead, which makes the event milder"
 SPEEDS_UP_BEFORE = "in {} it asked to speed up before BV was in its lane, and its speed was held"
 
@@ -27,10 +29,21 @@ def cruise_words(did: Sequence[str], *, script: bool) -> str:
     return f"{'; '.join(did)}: let it cruise at {speed}, or set av.before_event=controller"
 
 
+def script_words(tried: Mapping[str, float] | None) -> Iterator[str]:
+    """What a TraCI script (`TriedScript`) leaves to others, a line each."""
+    if tried is not None and (idle_s := tried["idle_s"]) > LONGEST_S:
+        waits = f"the script looks at no vehicle in the first {idle_s:.1f} s of a test, in which a car may cut in"
+        yield f"{waits}: leave out steps that only wait"
+    elif tried is not None and (left_s := tried["left_s"]) > LONGEST_S:
+        left = f"the script gives no command for {left_s:.1f} s behind a car that cuts in (tried for 15 s)"
+        yield f"{left}: SUMO’s model would drive then, here it keeps its speed (docs/controllers.md)"
+
+
 def acted_words(scenario: str, before: Mapping[str, Any] | None) -> Iterator[str]:
     """What the vehicle did before the event, or did not after it (`before_event`), a line each."""
     if before is None:
         return
+    yield from script_words(before["script"])
     if before["n_events"] and not before["n_braked"] and not before["built_in"]:
         yield NEVER_BRAKED
     if (n := before["n_fell_behind"]) > MANY * before["n_events"] and not before["built_in"]:
@@ -42,11 +55,11 @@ def acted_words(scenario: str, before: Mapping[str, Any] | None) -> Iterator[str
             sees = " ".join(shown.shows)
             yield f"SUMO changes lanes in one step: this vehicle cannot see that {sees}, as drivers can"
         elif before["n_events"] and not before["n_braked_early" if follows else "n_took_over_early"]:
-            yield late_words(scenario, script=before["script"])
+            yield late_words(scenario, script=before["script"] is not None)
     if not before["waits"]:
         return
     did = [BRAKES_BEFORE.format(tests(n))] if (n := before["n_braked_before"]) else []
     if (n := before["n_asked_to_speed_up"]) and not before["built_in"]:  # our own models do, which is known
         did.append(SPEEDS_UP_BEFORE.format(tests(n)))
     if did:
-        yield cruise_words(did, script=before["script"])
+        yield cruise_words(did, script=before["script"] is not None)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, Literal
 
@@ -12,7 +12,7 @@ from harness.estimators.limits import clopper_pearson
 from harness.families import family_named
 from harness.loop.cells import BRAKED_MPS2, FAR_BEHIND_S
 from harness.numbers import tests
-from harness.report.acted import BRAKES_BEFORE, NEVER_BRAKED, SPEEDS_UP_BEFORE, cruise_words, late_words
+from harness.report.acted import BRAKES_BEFORE, NEVER_BRAKED, SPEEDS_UP_BEFORE, cruise_words, late_words, script_words
 from harness.shown import ShownInPython
 
 SLOW_S = 0.1
@@ -133,7 +133,7 @@ class AvCheck(ShownInPython):
     scenario: str
     follows: Follows | None = None
     idm_follows: Follows | None = None
-    script: bool = False
+    script: Mapping[str, float] | None = None
 
     @property
     def events(self) -> str:
@@ -172,10 +172,10 @@ def verdict(check: AvCheck) -> str:
         )
     hides = family_named(check.scenario).words.late[0] and (check.shows or check.follows is not None)
     if hides and check.source == "controller" and not behaviour.n_took_over_early:
-        advice += f" But {late_words(check.scenario, script=check.script)}."
+        advice += f" But {late_words(check.scenario, script=check.script is not None)}."
     if check.shows and check.source != "model" and behaviour.n_asked_to_speed_up:
         asked = SPEEDS_UP_BEFORE.format(tests(behaviour.n_asked_to_speed_up))
-        advice += f" But {cruise_words([asked], script=check.script)}."
+        advice += f" But {cruise_words([asked], script=check.script is not None)}."
     shows = int(1.0 / clopper_pearson(0, n, 0.1)[1])  # with 90 % confidence
     rare = "" if check.source == "model" else f" (a fault in fewer than 1 of {shows} tests may not show: --tests)"
     return (
@@ -190,10 +190,12 @@ def _doubts(check: AvCheck) -> Iterator[str]:
     behaviour, follows = check.behaviour, check.follows
     if not (behaviour.n_events and behaviour.braking_share > 0.0 and behaviour.min_acceleration_mps2 <= -BRAKED_MPS2):
         yield NEVER_BRAKED
+    yield from script_words(check.script)
     if follows is not None and follows.n_hit:
         yield f"in {follows.n_hit} of {check.n_episodes} tests it hit the vehicle ahead before anything happened."
     if check.shows and behaviour.n_braked_before:
-        yield f"{cruise_words([BRAKES_BEFORE.format(tests(behaviour.n_braked_before))], script=check.script)}."
+        braked = BRAKES_BEFORE.format(tests(behaviour.n_braked_before))
+        yield f"{cruise_words([braked], script=check.script is not None)}."
     if follows is not None and follows.headway_s > FAR_BEHIND_S:
         behind = f"{follows.headway_s:.1f} s behind the vehicle ahead"
         yield f"when the event begins it is {behind}, which makes that milder: let it keep up."

@@ -78,7 +78,7 @@ class ShortAnswer:
 
 def short_answer(campaign: Campaign, manifest: Mapping[str, Any], estimates: Estimates) -> ShortAnswer:
     """The answer of a run's estimates, with what its ``manifest`` says besides."""
-    vehicle, parameters = vehicle_words(campaign.av, script=manifest.get("script"))
+    vehicle, parameters = vehicle_words(campaign.av, manifest.get("script"))
     return ShortAnswer(
         vehicle=vehicle,
         parameters=tuple(parameters),
@@ -94,8 +94,8 @@ def tests_words(n: int, engine: str, scenario: str) -> str:
     return f"{tests(n)} in {'SUMO' if engine == 'sumo' else 'SUMO’s twin'}, {scenario}"
 
 
-def vehicle_words(av: AutomatedVehicle, *, script: float | None = None) -> tuple[str, list[tuple[str, str]]]:
-    """Who drives the vehicle, and its parameters that are not defaults; ``script`` is the step of a TraCI script, s."""
+def vehicle_words(av: AutomatedVehicle, script: Mapping[str, float] | None = None) -> tuple[str, list[tuple[str, str]]]:
+    """Who drives the vehicle, and its parameters that are not defaults; ``script`` as in the manifest."""
     chosen = dict[str, Any]()
     for section, key in ((av.parameters, ""), (av.reaction, "reaction")):
         if isinstance(section, BaseModel):
@@ -111,7 +111,7 @@ def vehicle_words(av: AutomatedVehicle, *, script: float | None = None) -> tuple
     elif script:  # SUMO would know its vehicle's type, whose numbers hold until the script sets others
         accel, decel = plain(av.traci_style.accel_mps2), plain(av.traci_style.decel_mps2)
         chosen["type"] = f"accel {accel}, decel {decel}, minGap 0"
-        chosen |= {} if script == STEP_S else {"step": f"{plain(script)} s"}
+        chosen |= {} if script["step_s"] == STEP_S else {"step": f"{plain(script['step_s'])} s"}
     elif av.traci is not None:
         name = f"TraCI client {Path(av.traci.command.split()[0]).name}"
     elif av.fmu is not None:

@@ -16,9 +16,8 @@ import numpy as np
 from harness.arguments import AtLeastTwo, checked
 from harness.campaign.campaign import Campaign
 from harness.campaign.files import campaign_of
-from harness.campaign.python_files import is_script
 from harness.campaign.vehicle import AutomatedVehicle
-from harness.controllers.find import build_host, has_foreign_code
+from harness.controllers.find import build_host, has_foreign_code, tried_script
 from harness.controllers.hosts import ControllerHost, Failures
 from harness.controllers.protocol import BatchObservation
 from harness.loop.loop import EpisodeLoop, Shard
@@ -72,7 +71,7 @@ def check_av(campaign: Campaign | str | Path, n_episodes: AtLeastTwo = EPISODES)
     of_idm, idm_speed = _timed_run(prepare(resolve(idm, "av-check")), n_episodes)
     bounds = tested.av.limits if isinstance(tested.av.parameters, dict) else tested.av.parameters
     limits = bounds.min_acceleration_mps2, bounds.max_acceleration_mps2
-    if script := is_script(tested.av.controller or ""):  # clipped by its type's, see docs/controllers.md
+    if script := tried_script(tested.av):  # clipped by its type's, see docs/controllers.md
         a = np.concatenate([[], *(trace[:-1, -1, 2] for trace in first.traces.values())])  # it may change its own type
         low, high = -tested.av.traci_style.decel_mps2, tested.av.traci_style.accel_mps2
         limits = float(np.fmin.reduce(a, initial=low)), float(np.fmax.reduce(a, initial=high))
@@ -89,7 +88,7 @@ def check_av(campaign: Campaign | str | Path, n_episodes: AtLeastTwo = EPISODES)
         idm_behaviour=_behaviour(of_idm, limits, acted, early=early),
         speed=own_speed, idm_speed=idm_speed, scenario=family.name,
         follows=_follows(first) if family.follows else None,
-        idm_follows=_follows(of_idm) if family.follows else None, script=script,
+        idm_follows=_follows(of_idm) if family.follows else None, script=script and script._asdict(),
     )  # fmt: skip
 
 

@@ -133,7 +133,8 @@ def run_families(campaign: Campaign, out: Path, *, workers: int | None, resume: 
     missed = campaign.stop.rhw is not None and not rule.look.stopped
     answers = {name: (result.shown.estimates, result.shown.manifest) for name, result in results.items()}
     answer = hour_answer(hour, ready, answers, campaign.stop.confidence)
-    vehicle, parameters = vehicle_words(campaign.av, script=next(iter(ready.values())).script)
+    script = next(iter(ready.values())).script
+    vehicle, parameters = vehicle_words(campaign.av, script and script._asdict())
     content = {
         "format": 1, "name": campaign.name, "campaign_crc32": zlib.crc32(yaml),
         "seed": campaign.seed, "engine": campaign.world.engine,

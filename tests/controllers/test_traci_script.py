@@ -12,9 +12,10 @@ import pytest
 
 from harness.campaign.files import load_campaign
 from harness.cli import main
-from harness.controllers.find import script_step_s
+from harness.controllers.find import tried_script
 from harness.controllers.traci_style import TraciStyleController
 from harness.errors import CampaignError
+from harness.report.acted import script_words
 from harness.resolved import resolve
 from harness.sampling import prepare
 from harness.worlds.sumo import SumoWorld
@@ -247,7 +248,7 @@ def test_how_often_it_is_asked_is_what_it_asks_for_and_one_that_names_none_is_to
     for name, script in scripts.items():
         (folder / name).write_text(script, "utf-8")
         for _ in range(2):
-            assert script_step_s(load_campaign(str(folder / name)).av) == (
+            assert tried_script(load_campaign(str(folder / name)).av).step_s == (
                 0.2 if name in ("cfg.py", "named.py") else 0.1
             )
     note, *asked = capsys.readouterr().err.splitlines()
@@ -266,20 +267,39 @@ def test_a_script_that_bounds_its_braking_itself_is_told_nothing_of_its_type(bou
     own = f"traci.vehicle.setSpeed('ego', 20.0); {bound}" if bound != "given" else "traci.vehicle.setSpeed('ego', 20.0)"
     (tmp_path / "my.py").write_text(body.replace("traci.vehicle.setSpeed('ego', 20.0)", own), "utf-8")
     overrides = ["av.traci_style.decel_mps2=4.5"] if bound == "given" else []
-    assert script_step_s(load_campaign(str(tmp_path / "my.py"), overrides).av) == 0.1
+    assert tried_script(load_campaign(str(tmp_path / "my.py"), overrides).av).step_s == 0.1
     told, loose = capsys.readouterr().err, "note: my.py sets a speed mode in which no decel bounds its braking"
     assert told.startswith(loose) if "SpeedMode" in bound else not told
 
 
 @pytest.mark.parametrize(("steps", "told"), [(0, ""), (11, ""), (12, "looks at no vehicle in the first 1.1 s")])
-def test_a_script_that_first_waits_is_told_that_each_test_begins_with_its_first_line(steps, told, tmp_path, capsys):
+def test_a_script_that_first_waits_is_told_that_each_test_begins_with_its_first_line(steps, told, tmp_path):
     waits = f"traci.vehicle.add('ego', 'r')\nfor _ in range({steps}): traci.simulationStep()\nwhile"
     keeps = "traci.vehicle.setSpeed('ego', traci.lane.getMaxSpeed(traci.vehicle.getLaneID('ego')))"
     body = text(keeps, LOOP.replace("while", waits)).replace('"sumo"', '"sumo", "--step-length", "0.1"')
     (tmp_path / f"my{steps}.py").write_text(body, "utf-8")
-    assert script_step_s(load_campaign(str(tmp_path / f"my{steps}.py")).av) == 0.1
-    assert told in (said := capsys.readouterr().err)
+    tried = tried_script(load_campaign(str(tmp_path / f"my{steps}.py")).av)._asdict()
+    assert tried["step_s"] == 0.1
+    assert told in (said := " ".join(script_words(tried)))
     assert bool(told) == bool(said)
+
+
+@pytest.mark.parametrize(
+    ("command", "left_s"),
+    [
+        ("traci.vehicle.setSpeed('ego', 20.0)", 0.0),
+        ("traci.vehicle.setSpeed('ego', 20.0 if traci.simulation.getTime() < 6.0 else -1)", 9.0),
+        ("if traci.simulation.getTime() < 0.2: traci.vehicle.slowDown('ego', 20.0, 1.0)", 10.0),
+    ],
+)
+def test_a_script_that_leaves_the_vehicle_to_sumo_is_told_that_here_it_keeps_its_speed(command, left_s, tmp_path):
+    body = text(command).replace('"sumo"', '"sumo", "--step-length", "0.1"')
+    (tmp_path / "my.py").write_text(body, "utf-8")
+    tried = tried_script(load_campaign(str(tmp_path / "my.py")).av)
+    assert tried.left_s == pytest.approx(left_s, abs=2.0)
+    assert [f"gives no command for {tried.left_s:.1f} s behind" in said for said in script_words(tried._asdict())] == (
+        [True] if left_s else []
+    )
 
 
 def test_a_stored_answer_is_the_same_when_the_script_has_gone_or_is_broken(tmp_path):
