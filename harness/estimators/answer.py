@@ -175,8 +175,8 @@ def before_event(campaign: Campaign, manifest: Mapping[str, Any], counts: Mappin
     """In how many tests a vehicle did each of `ACTS`; ``waits`` says whether it holds its speed while BV comes."""
     waits = bool(manifest.get("events_show")) and not campaign.av.acts_before_event
     acts = {name: counts.get(name, 0) for name in ("n_events", *(f"n_{act}" for act in ACTS))}
-    own = {"source": campaign.av.source, "built_in": campaign.av.model is not None, "script": manifest.get("script")}
-    return {**own, "waits": waits, **acts}
+    own = {"source": campaign.av.source, "built_in": campaign.av.model is not None}
+    return {**own, "tried_script": manifest.get("tried_script"), "waits": waits, **acts}
 
 
 MANY = 0.1

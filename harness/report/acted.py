@@ -43,7 +43,7 @@ def acted_words(scenario: str, before: Mapping[str, Any] | None) -> Iterator[str
     """What the vehicle did before the event, or did not after it (`before_event`), a line each."""
     if before is None:
         return
-    yield from script_words(before["script"])
+    yield from script_words(script := before.get("tried_script"))
     if before["n_events"] and not before["n_braked"] and not before["built_in"]:
         yield NEVER_BRAKED
     if (n := before["n_fell_behind"]) > MANY * before["n_events"] and not before["built_in"]:
@@ -55,11 +55,11 @@ def acted_words(scenario: str, before: Mapping[str, Any] | None) -> Iterator[str
             sees = " ".join(shown.shows)
             yield f"SUMO changes lanes in one step: this vehicle cannot see that {sees}, as drivers can"
         elif before["n_events"] and not before["n_braked_early" if follows else "n_took_over_early"]:
-            yield late_words(scenario, script=before["script"] is not None)
+            yield late_words(scenario, script=script is not None)
     if not before["waits"]:
         return
     did = [BRAKES_BEFORE.format(tests(n))] if (n := before["n_braked_before"]) else []
     if (n := before["n_asked_to_speed_up"]) and not before["built_in"]:  # our own models do, which is known
         did.append(SPEEDS_UP_BEFORE.format(tests(n)))
     if did:
-        yield cruise_words(did, script=before["script"] is not None)
+        yield cruise_words(did, script=script is not None)

@@ -119,7 +119,7 @@ def family_rows(content: Mapping[str, Any]) -> Iterator[tuple[str, ...]]:
             if (unseen := _unseen(family)) is not None:
                 rate = f"< {number(unseen[1])} ({number(per_hour)} as fitted)"
         impact = family.get("median_impact_mps")
-        hard = "no crash seen" if impact is None else f"median impact {tenths(impact)} m/s"
+        hard = "no crash seen" if impact is None else f"impact {tenths(impact)} m/s"
         yield name, called(name), part, rate, beside, hard
 
 

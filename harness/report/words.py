@@ -78,7 +78,7 @@ class ShortAnswer:
 
 def short_answer(campaign: Campaign, manifest: Mapping[str, Any], estimates: Estimates) -> ShortAnswer:
     """The answer of a run's estimates, with what its ``manifest`` says besides."""
-    vehicle, parameters = vehicle_words(campaign.av, manifest.get("script"))
+    vehicle, parameters = vehicle_words(campaign.av, manifest.get("tried_script"))
     return ShortAnswer(
         vehicle=vehicle,
         parameters=tuple(parameters),

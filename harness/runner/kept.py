@@ -237,7 +237,7 @@ def take_over(
         "campaign_crc32": zlib.crc32(yaml), "signature": signature(yaml),
         "created": earlier.get("created") or datetime.now(UTC).isoformat(timespec="seconds"),
         "seed": campaign.seed, "engine": campaign.world.engine, "versions": versions(), "cpu": cpu_name(),
-        "controller_sha256": resolved.controller_sha256, "script": resolved.script and resolved.script._asdict(),
+        "controller_sha256": resolved.controller_sha256, "tried_script": resolved.script and resolved.script._asdict(),
         "events_show": family.shows(environment),
         "distance_per_test_m": None if campaign.av.acts_before_event else family.mean_distance_m(environment), **facts,
     }  # fmt: skip
