@@ -80,11 +80,11 @@ def read_text(path: Path) -> str:
     except FileNotFoundError:
         meant = did_you_mean(path.name, [file.name for file in path.parent.glob("*.y*ml")])
         if (cloned := Path(__file__).parents[2] / path).is_file():  # as docs name those beside this package
-            meant = f"Write {cloned}."
+            meant = f"Name {cloned}."
         found, mend = "no such file", meant or "Check the spelling and the folder that you are in."
     except IsADirectoryError:
         of_run = path / "campaign.yaml"
-        found, mend = "a folder", f"Write {of_run}." if of_run.is_file() else "Name the file inside it."
+        found, mend = "a folder", f"Name {of_run}." if of_run.is_file() else "Name the file inside it."
     except UnicodeDecodeError as error:
         found, mend = f"bytes that are not UTF-8 (at byte {error.start})", "Save the file as UTF-8 text."
     except (OSError, ValueError) as error:

@@ -66,7 +66,8 @@ def estimate(
     """
     several = exposures or counts or (folder / FAMILIES).is_file()
     if several and (estimators or environment is not None):
-        raise click.UsageError("-e and --environment are for the folder of one scenario, such as DIR/cut_in.")
+        found, expected = "a folder of several scenarios", "with -e or --environment the folder of one"
+        raise HarnessError("harness estimate", found, expected, f"Name {folder / 'cut_in'}, say.")
     if estimators and environment is not None:
         raise click.UsageError("--environment does not go with -e: tests of shells alone can be moved.")
     if write:

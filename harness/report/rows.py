@@ -165,7 +165,9 @@ def _beside(reference: Mapping[str, Any], *, acts: bool, **how: bool) -> Row:
     return Row("ratio", "× competent driver", *ratio_texts(reference, **how), driver)
 
 
-def ratio_texts(reference: Mapping[str, Any], *, wide: bool, from_below: bool, softened: bool) -> tuple[str, str]:
+def ratio_texts(
+    reference: Mapping[str, Any], *, wide: bool = False, from_below: bool = False, softened: bool = False
+) -> tuple[str, str]:
     """A ratio to a reference, and its interval, of which a ``wide`` one says what it says with one end alone.
 
     That a vehicle crashes less is said with a reserve where it has ``softened`` the events (`n_softened`).

@@ -12,7 +12,7 @@ from harness.estimators.answer import AssumedOfRate, n_softened
 from harness.estimators.estimate import WIDE_RHW
 from harness.families import family_named
 from harness.families.words import ELSEWHERE, EXCLUDED
-from harness.numbers import count, duration, interval, number, plain, ratio, share, tenths, two_digits_up
+from harness.numbers import MISSING, count, duration, interval, number, plain, ratio, share, tenths, two_digits_up
 from harness.report import words
 from harness.report.notes import note_words
 from harness.report.rows import Row, decided, end, looking_words, ratio_texts
@@ -53,7 +53,10 @@ def hour_lines(content: Mapping[str, Any], report: Path | None = None, *, readin
     answer, took_s = answer_of_sum(content, readings=readings), content["wall_time_s"]
     head = words.headed(answer, None if readings else took_s)  # of the run, not of an answer given anew
     parts = words.columns(
-        [(row[1], row[2] + " of all" * (i == 0), *row[3:]) for i, row in enumerate(family_rows(content))]
+        [
+            (row[1], row[2] + " of all" * (i == 0 and row[2] != MISSING), *row[3:])
+            for i, row in enumerate(family_rows(content))
+        ]
     )
     under = words.wrapped([*(f"! {text}" for text in answer.warnings), exposures(content), answer.scope])
     ends = [] if report is None else [f"  report  {report}"]
@@ -66,8 +69,11 @@ def _sum_rows(content: Mapping[str, Any], *, readings: bool) -> Iterator[Row]:
     # Where a limit was rejected after few tests the upper end says nothing.
     wide = hour["rhw"] is None or hour["rhw"] > WIDE_RHW
     from_below = wide and decision is not None and decision["verdict"] == "rejected"
+    far = seen and hour["ci_high"] is not None and hour["ci_high"] >= FAR_APART * hour["ci_low"]
     if from_below:
         yield Row("rate", f"{what} so far", f"> {number(hour['ci_low'])} per hour", f"estimate {number(hour['rate'])}")
+    elif far:
+        yield Row("rate", what, f"< {number(hour['ci_high'])} per hour", f"estimate {number(hour['rate'])}")
     elif seen:
         ends = between(hour["ci_low"], hour["ci_high"], hour["rate"])
         per_km = f"{number(content['per_1e6_km'])} per million km"
@@ -75,16 +81,13 @@ def _sum_rows(content: Mapping[str, Any], *, readings: bool) -> Iterator[Row]:
     else:
         yield Row("rate", what, f"< {number(hour['upper_bound'])} per hour", "no crash seen")
     softened = any(n_softened(family["before_event"]) for family in content["families"].values())
-    how = {"from_below": from_below, "softened": softened}
+    how = {"wide": from_below or far, "from_below": from_below, "softened": softened}
     yield beside_row("× competent driver", content, content["beside"], **how)
     for reading in content["readings"] if readings else ():
         yield beside_row(f"× {reading['reference']}", content, reading, **how)
 
 
-def beside_row(
-    name: str, content: Mapping[str, Any], beside: Mapping[str, Any], *, from_below: bool = False,
-    softened: bool = False,
-) -> Row:  # fmt: skip
+def beside_row(name: str, content: Mapping[str, Any], beside: Mapping[str, Any], **how: bool) -> Row:
     """The rate of a sum ``beside`` a reading of that driver, where crashes were seen or none; see `ratio_texts`."""
     if beside["ratio"] is None:
         return Row("ratio", name, "no ratio", "", "such a driver never crashes here")
@@ -97,21 +100,22 @@ def beside_row(
     if (limits := beside.get("limits_over_assumed")) is not None:
         most = "no limit" if limits[1] is None else ratio(limits[1])
         over = f"limits {ratio(limits[0])} to {most} over exposures"
-    return Row("ratio", name, *ratio_texts(reading, wide=from_below, from_below=from_below, softened=softened), over)
+    return Row("ratio", name, *ratio_texts(reading, **how), over)
 
 
 def family_rows(content: Mapping[str, Any]) -> Iterator[tuple[str, ...]]:
     """A row each: key, name, share of the rate, crashes per hour and ratio with their intervals, how hard."""
     for name, family in sorted(content["families"].items(), key=lambda item: -(item[1]["rate_per_hour"] or 0.0)):
-        per_hour, part, beside = family["rate_per_hour"], "0 %", "–"
+        per_hour, part, beside = family["rate_per_hour"], MISSING, MISSING
         rate = f"< {number(family['upper_bound'])}"
         if family["n_crashes"]:
-            part = "" if family["share"] is None else share(family["share"])
             low, high = family["ci_low"], family["ci_high"]
             far = high is not None and high >= FAR_APART * low
             rate = f"{number(per_hour)} (≥ {number(low)})" if high is None else interval(low, high, per_hour)
             if far:  # what is known is a limit
                 rate = f"< {number(high)} (est. {number(per_hour)})"
+            elif family["share"] is not None:
+                part = share(family["share"])
             if (times := family["ratio"]) is not None:
                 least, most = number(family["ratio_low"], 2), number(family["ratio_high"], 2)
                 ends = f"≥ {least}" if family["ratio_high"] is None else f"{least}–{most}"
@@ -179,9 +183,9 @@ def exposures(content: Mapping[str, Any]) -> str:
         phrases.setdefault(kind, []).append(f"{called(name)} {per_hour}" + (f" ({'; '.join(notes)})" if notes else ""))
     parts = [f"{kind}: {', '.join(scenarios)}" for kind, scenarios in phrases.items()]
     more = "other numbers: harness sensitivity"
-    low, high = (number(each, 2) for each in content["per_hour"].get("over_assumed") or (0.0, 0.0))  # older runs: none
-    if low != high:
-        more = f"rate over assumed ranges {low} to {high}"
+    low, high = content["per_hour"].get("over_assumed") or (0.0, 0.0)  # older runs have none
+    if number(low) != number(high):
+        more = f"rate over their ranges {interval(low, high)}"
     return f"events per hour, {'; '.join([*parts, more])}"
 
 

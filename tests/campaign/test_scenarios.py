@@ -218,13 +218,13 @@ def test_files_that_are_refused_as_a_whole(read, tmp_path, content, words):
 
 def test_the_folder_of_a_run_is_told_by_its_campaign(tmp_path):
     (tmp_path / "campaign.yaml").touch()
-    with pytest.raises(CampaignError, match=rf"a folder; .*Write {tmp_path}/campaign\.yaml"):
+    with pytest.raises(CampaignError, match=rf"a folder; .*Name {tmp_path}/campaign\.yaml"):
         read_yaml(tmp_path)
 
 
 def test_a_file_of_the_clone_is_told_where_it_is(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    with pytest.raises(CampaignError, match=rf"no such file; .*Write {FOLDER}/smoke\.yaml"):
+    with pytest.raises(CampaignError, match=rf"no such file; .*Name {FOLDER}/smoke\.yaml"):
         load_campaign("scenarios/smoke.yaml")
 
 
