@@ -183,9 +183,9 @@ def exposures(content: Mapping[str, Any]) -> str:
         phrases.setdefault(kind, []).append(f"{called(name)} {per_hour}" + (f" ({'; '.join(notes)})" if notes else ""))
     parts = [f"{kind}: {', '.join(scenarios)}" for kind, scenarios in phrases.items()]
     more = "other numbers: harness sensitivity"
-    low, high = content["per_hour"].get("over_assumed") or (0.0, 0.0)  # older runs have none
-    if number(low) != number(high):
-        more = f"rate over their ranges {interval(low, high)}"
+    least, most = content["per_hour"].get("over_assumed") or (0.0, 0.0)  # older runs have none
+    if number(least) != number(most):
+        more = f"rate over their ranges {interval(least, most)}"
     return f"events per hour, {'; '.join([*parts, more])}"
 
 
