@@ -97,9 +97,9 @@ class FamilyTests(NamedTuple):
         return np.ones(2) if times is None else np.array(times) @ self.seen.design.p / self.seen.design.p.sum()
 
     def limits(self, level: Level) -> RateLimits:
-        """Rate per hour of the family alone."""
-        per_hour, per_test = self.per_hour, self.seen.limits(level)
-        return RateLimits(*(per_hour * value for value in per_test))
+        """Rate per hour of the family alone, with the error of ``p_counted``: at most a crash in every test."""
+        limits = PerHour([self]).limits(level)
+        return limits._replace(high=min(limits.high, self.per_hour))
 
 
 class PerHour:

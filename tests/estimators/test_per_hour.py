@@ -122,6 +122,16 @@ def test_exposures_scale_it_and_one_alone_is_its_own():
     assert alone.families[0].exposure.source == "given"
 
 
+def test_a_scenario_alone_has_limits_with_the_error_of_its_events():
+    """As the sum has: with crashes that are known, it is all that is left."""
+    crashes = family("lead_brakes", [1e-4, 1e-9], [10**9, 9], [5 * 10**8, 0], ASSUMED)
+    unsure = replace_design(crashes, p_event_se=0.1)
+    assert unsure.limits(LEVEL)[:3] == PerHour([unsure]).limits(LEVEL)[:3]
+    told = PerHour([unsure]).to_json(0.9, 32.0)["families"]["lead_brakes"]
+    assert told["ci_high"] - told["ci_low"] == pytest.approx(2.0 * LEVEL.z * 0.1 * unsure.rate, rel=1e-3)
+    assert told["upper_bound"] == told["ci_high"]
+
+
 def test_ratio_to_the_competent_driver_and_what_assumed_exposures_do_to_it():
     hour = PerHour(THREE)
     ratio, low, high = hour.ratio(LEVEL)
