@@ -43,8 +43,9 @@ if TYPE_CHECKING:
 CLOSED_PIPE_EXIT_CODE = 76
 """Exit code of a process whose controller has closed its pipe."""
 _ATTEMPTS = 3
-_LOOK_S, _DYING_S = 0.5, 1.0
-"""Time between two looks, and how long a process may take to end after its pipe has been closed."""
+_LOOK_S, _DYING_S, _STOPPED_S = 0.5, 1.0, 5.0
+"""Time between two looks, how long a process may take to end after its pipe has been closed, and how long it may be
+stopped."""
 _PRELOADED = "harness.runner.preloaded"
 SAFE_PATH = "PYTHONSAFEPATH"
 
@@ -132,6 +133,12 @@ class Child:
             raise self._answer
         return self._answer
 
+    def go_on(self) -> None:
+        """Let it go on if it was stopped."""
+        if self._process.pid is not None:
+            with suppress(ProcessLookupError):
+                os.kill(self._process.pid, signal.SIGCONT)
+
     def kill(self) -> int | None:
         """End it at once, with everything that it has started; returns its exit code."""
         atexit.unregister(self.kill)
@@ -158,10 +165,12 @@ _Child = TypeVar("_Child", bound=Child)
 
 
 def first_to_answer(children: Sequence[_Child]) -> _Child:
-    """Wait for one that has an answer, or has died."""
+    """Wait for one that has an answer, or has died; one that a vehicle has stopped (SIGSTOP) is made to go on."""
     while True:
-        ready = wait([handle for child in children for handle in child.handles])
+        ready = wait([handle for child in children for handle in child.handles], _STOPPED_S)
         for child in children:
+            if not ready:
+                child.go_on()
             if not set(child.handles).isdisjoint(ready) and child.hears():
                 return child
 

@@ -220,6 +220,15 @@ class Tires(IDM):
         return super().step(seen) - 1e-9 * (Tires.n_driven > 150)
 
 
+class Stops(IDM):
+    """Stops its process in one test."""
+
+    def start(self, episode):
+        super().start(episode)
+        if episode.episode == 7:
+            os.kill(os.getpid(), signal.SIGSTOP)
+
+
 class LeavesTimer(IDM):
     """Leaves a timer behind whose handler raises: while the harness computes, or in the next call."""
 

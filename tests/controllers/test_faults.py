@@ -147,6 +147,7 @@ NO_FAULT = {
     "a function that is the vehicle": _of("only_a_function", min_acceleration_mps2=-4.0),
     "a default timeout of sockets, and a signal ignored": _of("ChangesItsProcess"),
     "one with nothing but step_batch": _of("OnlyStepBatch"),
+    "one that stops its process": _of("Stops", min_acceleration_mps2=-4.0),
 }
 
 
