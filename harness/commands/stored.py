@@ -174,10 +174,10 @@ def sensitivity(folder: Path, *, ranges: dict[str, tuple[float, float]], as_json
     say(
         *(not_moved_words(NotMoved(**each)) for each in content["not_moved"]),
         *([f"{still} neither by {share(LEAST_MOVE)}."] if n_still else ()),
-        "Under 'rate' and 'ratio' (to the competent driver) the left value is by how much they are multiplied with the "
-        "number at its lower end, the right one at its upper end; '–': only tests in that traffic would tell.",
-        "This assumes that the same share of each shell's events end in a crash; 'error' is by how much that is wrong "
-        "for a reference driver.",
+        "'rate' and 'ratio' (to the competent driver): times what, with the number at its lower … upper end. '–': traffic "
+        "too unlike what was tested; only a run in it would tell.",
+        "It is assumed that of each shell's events the same share end in a crash. 'may be off by': how wrong that is for "
+        "a reference driver, whose shares are known.",
         f"report  {page}",
     )
 
@@ -191,7 +191,7 @@ def _bar(bar: dict[str, Any]) -> dict[str, str]:
     values = "" if bar["values"] is None else " … ".join(map(plain, bar["values"]))
     cells = {"number": bar["what"], "known": f"{bar['known']} {values}", "rate": ends(bar["rate"])}
     off = " … ".join(share(off, least=0.001) for off in bar["off"]) if bar["off"] != [None, None] else ""
-    return {**cells, "ratio": ends(bar["ratio"]), "error": off, "remark": bar_note(bar)}
+    return {**cells, "ratio": ends(bar["ratio"]), "may be off by": off, "remark": bar_note(bar)}
 
 
 @click.command(

@@ -265,10 +265,12 @@ def _times(uncertain: Uncertain) -> str:
 
 
 def bar_note(bar: Mapping[str, Any]) -> str:
-    """Why the tests do not answer some of the environments of a `Bar`."""
+    """Why the tests do not answer some of the environments of a `Bar`; of an end that is unlike them, a dash says so."""
     why = {"laws that give no probabilities": bar["no_laws"], "unlike what was tested": bar["unlike"]}
+    if bar["values"] is not None:
+        return "laws that give no probabilities" * bool(bar["no_laws"])
     note = " and ".join(reason for reason, n in why.items() if n)
-    return f"{sum(why.values())} of {bar['n']}: {note}" if note and bar["values"] is None else note
+    return f"{sum(why.values())} of {bar['n']}: {note}" if note else ""
 
 
 def not_moved_words(of: NotMoved) -> str:
