@@ -174,10 +174,10 @@ def sensitivity(folder: Path, *, ranges: dict[str, tuple[float, float]], as_json
     say(
         *(not_moved_words(NotMoved(**each)) for each in content["not_moved"]),
         *([f"{still} neither by {share(LEAST_MOVE)}."] if n_still else ()),
-        "'rate' and 'ratio' (to the competent driver): times what, with the number at its lower … upper end. '–': traffic "
-        "too unlike what was tested; only a run in it would tell.",
-        "It is assumed that of each shell's events the same share end in a crash. 'may be off by': how wrong that is for "
-        "a reference driver, whose shares are known.",
+        "'rate' and 'ratio' (to the competent driver): times what, with the number at its lower … upper end. '–': that "
+        "traffic is too unlike what was tested; only a run in it would tell.",
+        "It is assumed that of each shell's events the same share end in a crash. 'may be off by': how wrong that is "
+        "for a reference driver, whose shares are known.",
         f"report  {page}",
     )
 

@@ -297,6 +297,10 @@ def require_controller(av: AutomatedVehicle) -> str | None:
         raise CampaignError(error.where, error.found, "a controller that can be made", error.mend) from error
 
 
+MOST_IDLE_S = 10.0
+"""Time after which a script is refused that has not looked at a vehicle: most events are over [assumed]."""
+
+
 class TriedScript(NamedTuple):
     """What a TraCI script does when it is tried: for 15 s, in which a car cuts in, and then drives ahead.
 
@@ -327,7 +331,13 @@ def tried_script(av: AutomatedVehicle) -> TriedScript | None:
         note = f"asks for harder braking than {bound:g} m/s², the decel of SUMO's default type, and gets that"
         _tell_once(f"{file} {note}; of another type: --set av.traci_style.decel_mps2=8, say")
     step_s = STEP_S * (every or 1)
-    return TriedScript(step_s, idle * step_s, left * step_s)
+    if (idle_s := idle * step_s) > MOST_IDLE_S:
+        found, expected = f"{name}, which looks at no vehicle for {idle_s:.0f} s", "a script that drives from its start"
+        mend = (
+            "A test is one run of it from its first line, for up to 20 s: leave out steps that only wait, or set the "
+        )
+        raise CampaignError("av.controller", found, expected, mend + "option that does: --set av.parameters.NAME=…")
+    return TriedScript(step_s, idle_s, left * step_s)
 
 
 def _sources_of_made(av: AutomatedVehicle) -> str | None:

@@ -265,7 +265,7 @@ def _times(uncertain: Uncertain) -> str:
 
 
 def bar_note(bar: Mapping[str, Any]) -> str:
-    """Why the tests do not answer some of the environments of a `Bar`; of an end that is unlike them, a dash says so."""
+    """Why the tests do not answer some of the environments of a `Bar`; of an end unlike them, a dash says so."""
     why = {"laws that give no probabilities": bar["no_laws"], "unlike what was tested": bar["unlike"]}
     if bar["values"] is not None:
         return "laws that give no probabilities" * bool(bar["no_laws"])

@@ -251,7 +251,8 @@ def _scope(campaign: Campaign, manifest: Mapping[str, Any], estimates: Estimates
         ended += f", given the {campaign.testing.shells.statement}"
     test = family_named(campaign.scenario).words.test
     if (times := manifest.get("tests_per_hour")) is not None:
-        test += f" (× {number(times, 2)} = per hour)"
+        events = f"{manifest['exposure']} {family_named(campaign.scenario).words.events}"
+        test += f" (× {number(times, 2)} = per hour, by {events})"
     return f"per test is per {test}; {scope_words(best.confidence, ended)}"
 
 

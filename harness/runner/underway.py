@@ -99,8 +99,9 @@ class Underway:
         if (design := self.run.source.design) is not None:
             write_sealed(self.run.folder / SHELLS, STORED_DESIGN.dump_python(design, mode="json"))
             resolved = self.run.resolved
-            per_hour = resolved.family.exposure(resolved.environment, resolved.parameters).per_hour
-            self.run = self.run.noting(tests_per_hour=per_hour / design.p_counted)
+            exposure = resolved.family.exposure(resolved.environment, resolved.parameters)
+            counted = "counted" if exposure.counted else "assumed"
+            self.run = self.run.noting(tests_per_hour=exposure.per_hour / design.p_counted, exposure=counted)
 
     def drive_before_tests(self) -> None:
         """Drive milder events, where the family has some, and baseline runs, where tests follow from them."""

@@ -284,6 +284,13 @@ def test_a_script_that_first_waits_is_told_that_each_test_begins_with_its_first_
     assert bool(told) == bool(said)
 
 
+def test_a_script_that_waits_for_most_of_a_test_is_refused_also_where_its_vehicle_is_named(tmp_path):
+    waits = "for _ in range(200): traci.simulationStep()\nwhile"
+    (tmp_path / "my.py").write_text(text("traci.vehicle.setSpeed('ego', 20.0)", LOOP.replace("while", waits)), "utf-8")
+    with pytest.raises(CampaignError, match=r"looks at no vehicle for 1[45] s; .*leave out steps that only wait"):
+        tried_script(load_campaign(str(tmp_path / "my.py"), ["av.traci_style.ego=ego"]).av)
+
+
 @pytest.mark.parametrize(
     ("command", "left_s"),
     [

@@ -25,7 +25,7 @@ def _rests(traffic: Environment | None, level: str) -> str:
 
 WORDS = Words(
     called="cut-in",
-    test="everyday overtaking, mostly without a cut-in",
+    test="overtaking, mostly without a cut-in",
     event="cut-in",
     events="cut-ins",
     since="BV entered the lane",
