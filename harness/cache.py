@@ -1,8 +1,8 @@
 """The cache: what is kept from run to run because it can be made again. Compiled kernels, challenge tables, pools.
 
 A file ends with a checksum of its name and content. One that is damaged, or has another's name, is ignored, and its
-content made anew. Where the cache cannot be written, files go to a folder of this user among the temporary files. So a
-cache may be read-only, and a user without a home folder has one, too.
+content made anew, as is what has no end: a pipe, a device. Where the cache cannot be written, files go to a folder of
+this user among the temporary files. So a cache may be read-only, and a user without a home folder has one, too.
 """
 
 from __future__ import annotations
@@ -85,7 +85,7 @@ def find(name: str) -> Path | None:
     """A sound file of a name, with its checksum at the end; None if there is none."""
     for path in places(name):
         with suppress(OSError):
-            if checksum(path, zlib.crc32(name.encode())) == _SEALED:
+            if path.is_file() and checksum(path, zlib.crc32(name.encode())) == _SEALED:
                 _used(path)
                 return path
     return None
@@ -95,7 +95,7 @@ def read(name: str) -> bytes | None:
     """What is kept under a name; None if nothing is, or it is damaged."""
     for path in places(name):
         with suppress(OSError):
-            content = path.read_bytes()  # once: a pool may be large
+            content = path.read_bytes() if path.is_file() else b""  # once: a pool may be large
             if zlib.crc32(content, zlib.crc32(name.encode())) == _SEALED:
                 _used(path)
                 return content[:-_SEAL_BYTES]

@@ -47,6 +47,8 @@ def flipped(bit: int):
         lambda path: path.write_bytes(path.read_bytes()[:-1]),
         lambda path: shutil.copy(path.with_name("other"), path),
         lambda path: (path.unlink(), path.mkdir()),
+        lambda path: (path.unlink(), os.mkfifo(path)),
+        lambda path: (path.unlink(), path.symlink_to("/dev/zero")),
     ],
 )
 def test_a_damaged_file_or_that_of_another_is_as_good_as_none(folder, damage):
@@ -55,6 +57,7 @@ def test_a_damaged_file_or_that_of_another_is_as_good_as_none(folder, damage):
     assert cache.read(NAME) == CONTENT
     damage(folder / NAME)
     assert cache.read(NAME) is None
+    assert cache.find(NAME) is None
     if (folder / NAME).is_file():
         cache.keep(NAME, CONTENT)
         assert cache.read(NAME) == CONTENT

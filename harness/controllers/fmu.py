@@ -96,9 +96,9 @@ def _unpacked(file: Path) -> Path:
 
 
 def _is_whole(folder: Path, archive: zipfile.ZipFile) -> bool:
-    files = (entry for entry in archive.infolist() if not entry.is_dir())
+    files = ((folder / entry.filename, entry.CRC) for entry in archive.infolist() if not entry.is_dir())
     with suppress(OSError):
-        return all(checksum(folder / entry.filename) == entry.CRC for entry in files)
+        return all(file.is_file() and checksum(file) == crc for file, crc in files)
     return False
 
 
