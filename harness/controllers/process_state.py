@@ -66,7 +66,7 @@ class OtherModules:
         types = [cls for module in places.values() for cls in vars(module).values() if isinstance(cls, type)]
         ours = [cls for cls in types if cls.__module__.partition(".")[0] in (OURS[0], "pathlib")]
         places |= {f"{cls.__module__}.{cls.__qualname__}": cls for cls in ours}
-        self._kept = {name: (place, _functions_and_numbers(vars(place))) for name, place in places.items()}
+        self._kept = {name: (place, _called_or_read(vars(place))) for name, place in places.items()}
 
     def restored(self) -> list[str]:
         """Put all back; names, as ``math`` or ``math.sqrt``, that had been replaced or deleted."""
@@ -91,5 +91,5 @@ def closed_to_files() -> str:
     return ""
 
 
-def _functions_and_numbers(names: dict[str, Any]) -> dict[str, Any]:
-    return {key: value for key, value in names.items() if key[:2] != "__" and (callable(value) or type(value) is float)}
+def _called_or_read(names: dict[str, Any]) -> dict[str, Any]:
+    return {k: v for k, v in names.items() if k[:2] != "__" and (callable(v) or type(v) in (float, type(sys)))}

@@ -231,6 +231,7 @@ def test_check_refuses_what_run_refuses_and_makes_nothing_but_controllers(av, wh
         "harness.controllers.hosts.Guard",
         "harness.controllers.hosts.Guard.acceleration",
         "harness.loop.loop.judge",
+        "harness.controllers.hosts.math",
         "io.BytesIO",
         "hashlib.sha256",
         "pathlib.Path.read_bytes",
