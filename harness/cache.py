@@ -146,7 +146,7 @@ def made_once(name: str, waits: Callable[[str], object], most_s: float = math.in
             path = next(places(name))
             path = path.with_name(f".{path.name}.lock")
             path.parent.mkdir(parents=True, exist_ok=True)
-            file = stack.enter_context(path.open("ab+"))  # a pipe would wait for who reads it
+            file = stack.enter_context(path.open("ab+", buffering=0))  # + as a pipe would wait for who reads it
             until = None
             while True:
                 try:
@@ -162,7 +162,6 @@ def made_once(name: str, waits: Callable[[str], object], most_s: float = math.in
             stack.callback(path.unlink, missing_ok=True)
             file.truncate(0)
             file.write(str(os.getpid()).encode())
-            file.flush()
         yield
 
 

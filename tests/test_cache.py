@@ -3,6 +3,7 @@
 import os
 import pwd
 import re
+import resource
 import shutil
 import tempfile
 import time
@@ -182,4 +183,15 @@ def test_who_does_not_get_on_is_not_waited_for_longer_than_that(folder):
     waited = []
     with cache.made_once(NAME, waited.append), cache.made_once(NAME, waited.append, most_s=0.2):
         assert len(waited) == 1
+    assert not list((folder / "pools").iterdir())
+
+
+def test_a_lock_is_held_also_where_nothing_can_be_written(folder):
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (0, hard))
+    try:
+        with cache.made_once(NAME, lambda _: None):
+            assert [path.name for path in (folder / "pools").iterdir()] == [".one.lock"]
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
     assert not list((folder / "pools").iterdir())

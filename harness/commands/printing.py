@@ -119,6 +119,7 @@ _OF_THE_SYSTEM = (
      "Correct it."),
     (("EACCES", "EPERM", "EROFS"), "no permission ({})", "a place that may be read and written",
      "Change its permissions, or choose another place."),
+    (("EMFILE", "ENFILE"), "no more files ({})", "some that may be open", f"Lift the limit (`ulimit -n`). {_AGAIN}"),
     (("EEXIST",), "a file", "a folder, or a place for one", "Move it away."),
     (("EISDIR",), "a path that leads to no file ({})", "a file, or a place for one", "Correct the path."),
 )  # fmt: skip

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import shutil
 
 import pyarrow.parquet as pq
@@ -210,6 +211,12 @@ def test_a_file_that_cannot_be_copied_is_named(tmp_path):
     assert told is not None
     assert told.where == str(tmp_path / "a" / "loop")
     assert told.found.startswith("Too many levels of symbolic links")
+
+
+def test_a_limit_of_open_files_that_is_reached_is_named():
+    told = system_error(OSError(errno.EMFILE, "Too many open files", "manifest.json"))
+    assert told is not None
+    assert (told.where, told.found) == ("manifest.json", "no more files (Too many open files)")
 
 
 def test_values_that_no_run_has_written_are_refused(stored):
