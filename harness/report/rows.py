@@ -56,8 +56,8 @@ def rows_of(campaign: Campaign, manifest: Mapping[str, Any], estimates: Estimate
     so_far = " so far" if best.untested and best.n_crashes else ""
     above_mps = campaign.crash.counts_above_mps
     what = (f"crash rate > {plain(above_mps)} m/s" if above_mps else "crash rate") + so_far
-    such = family_named(campaign.scenario).words.such
-    rows = [_rate_row(what, such, estimates, unseen, from_below=from_below)]
+    rates = manifest.get("tests_per_hour"), f" per million km{family_named(campaign.scenario).words.such}"
+    rows = [_rate_row(what, rates, estimates, unseen, from_below=from_below)]
     references = [each for each in best.details.get("references", ()) if each["crash_rate"] > 0.0][:1]
     how = {"wide": wide, "from_below": from_below}
     how["softened"] = n_softened(before_event(campaign, manifest, estimates.diagnostics)) > 0
@@ -77,9 +77,11 @@ def rows_of(campaign: Campaign, manifest: Mapping[str, Any], estimates: Estimate
         yield within(best.details["within"])
 
 
-def _rate_row(what: str, of_km: str, estimates: Estimates, unseen: AssumedOfRate | None, *, from_below: bool) -> Row:
-    """The rate with its interval, or with one limit alone where the other end says nothing; ``of_km`` driven how."""
-    best, distance_km = estimates.best, estimates.distance_per_test_km
+def _rate_row(
+    what: str, per: tuple[float | None, str], estimates: Estimates, unseen: AssumedOfRate | None, *, from_below: bool
+) -> Row:
+    """The rate with its interval, or with one limit alone where the other end says nothing; also ``per`` hour or km."""
+    best, distance_km, (tests_per_hour, of_km) = estimates.best, estimates.distance_per_test_km, per
     sign, shown, ends = "", best.crash_rate, interval(best.ci_low, best.ci_high, beside=best.crash_rate)
     sampled = f"estimate {number(best.crash_rate)}" if best.n_crashes else "no crash seen"
     if unseen is not None:
@@ -89,7 +91,9 @@ def _rate_row(what: str, of_km: str, estimates: Estimates, unseen: AssumedOfRate
         sign, shown, ends = "> ", best.ci_low, sampled
     elif not best.n_crashes or best.is_wide:
         sign, shown, ends = "< ", best.upper_limit, sampled
-    remark = "" if not distance_km else f"{sign}{number(shown * 1e6 / distance_km)} per million km{of_km}"
+    remark = f"{sign}{number(shown * 1e6 / distance_km)}{of_km}" if distance_km else ""
+    if tests_per_hour is not None:
+        remark = f"{sign}{number(shown * tests_per_hour)} per hour of driving"
     if unseen is not None:
         remark = f"none seen at {unseen.where}"
     return Row("rate", what, f"{sign}{number(shown)} per test", ends, remark)

@@ -250,9 +250,8 @@ def _scope(campaign: Campaign, manifest: Mapping[str, Any], estimates: Estimates
     elif stopped_by in ("rhw", "below_reference") and campaign.testing.shells.statement != ASSUMPTION_FREE:
         ended += f", given the {campaign.testing.shells.statement}"
     test = family_named(campaign.scenario).words.test
-    if (times := manifest.get("tests_per_hour")) is not None:
-        events = f"{manifest['exposure']} {family_named(campaign.scenario).words.events}"
-        test += f" (× {number(times, 2)} = per hour, by {events})"
+    if (known := manifest.get("exposure")) is not None:
+        test += f"; per hour by {known} {family_named(campaign.scenario).words.events}"
     return f"per test is per {test}; {scope_words(best.confidence, ended)}"
 
 

@@ -85,7 +85,7 @@ def estimate_in_other_traffic(
     keys = tested.manifest if moved.is_same else ("repeated",)
     manifest: dict[str, Any] = {key: tested.manifest[key] for key in keys if key in tested.manifest}
     distance_m = there.family.mean_distance_m(there.environment)
-    manifest |= {"campaign_hash": there.content_hash, "distance_per_test_m": distance_m}
+    manifest |= {"campaign_hash": there.content_hash, "distance_per_test_m": distance_m, "tests_per_hour": None}
     if there.parameters.replicates is not None and there.parameters.unseen:
         manifest.pop("assumed", None)  # replicates say it better
     elif not moved.is_same:
