@@ -177,7 +177,8 @@ def verdict(check: AvCheck) -> str:
         asked = SPEEDS_UP_BEFORE.format(tests(behaviour.n_asked_to_speed_up))
         advice += f" But {cruise_words([asked], script=check.script is not None)}."
     shows = int(1.0 / clopper_pearson(0, n, 0.1)[1])  # with 90 % confidence
-    rare = "" if check.source == "model" else f" (a fault in fewer than 1 of {shows} tests may not show: --tests)"
+    unseen = f" (a fault in fewer than 1 of {shows}, or only on the rare, hard {check.events} of a run, may not show)"
+    rare = "" if check.source == "model" else unseen
     return (
         f"READY: {n} tests twice, the same bits{rare}; it braked after {behaviour.braking_share:.0%} of "
         f"{behaviour.n_events} {check.events}, {behaviour.reaction_s:.1f} s after they began (median; some leave time "
