@@ -93,7 +93,7 @@ def _rate_row(
         sign, shown, ends = "< ", best.upper_limit, sampled
     remark = f"{sign}{number(shown * 1e6 / distance_km)}{of_km}" if distance_km else ""
     if tests_per_hour is not None:
-        remark = f"{sign}{number(shown * tests_per_hour)} per hour of driving"
+        remark = f"{sign}{number(shown * tests_per_hour)} per hour"
     if unseen is not None:
         remark = f"none seen at {unseen.where}"
     return Row("rate", what, f"{sign}{number(shown)} per test", ends, remark)

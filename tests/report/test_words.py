@@ -122,7 +122,7 @@ def test_a_rate_that_counts_no_crash_where_nothing_was_tested_says_so(name, unte
     shells = content["estimates"]["shells"]["details"]["shells"]
     assert any(not each["n_episodes"] for each in shells) == untested
     assert (rate["what"] == "crash rate so far") == untested
-    assert rate["remark"].endswith(" per hour of driving")
+    assert rate["remark"].endswith(" per hour")
     assert not rows["ratio"]["value"].startswith("≥")
     assert (rows["impact"]["what"] == "impact speed so far") == untested
 

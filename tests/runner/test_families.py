@@ -93,7 +93,7 @@ def test_the_answer_is_the_sum_over_families_of_what_their_runs_say(run):
         times = read_manifest(run.folder / name)["tests_per_hour"]
         assert times * per_test == pytest.approx(part["rate_per_hour"], rel=1e-9)
         if per_test and "< " not in (said := repr(harness.estimate(run.folder / name)).splitlines()[1]):
-            assert f"{number(part['rate_per_hour'])} per hour of driving" in said
+            assert f"{number(part['rate_per_hour'])} per hour" in said
 
 
 def test_workers_and_interruptions_change_no_bit(run, tmp_path):
