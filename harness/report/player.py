@@ -35,10 +35,10 @@ MOTION = ("x_m", "v_mps")
 LANE_M = 3.6
 BRAKES_MPS2 = 0.5
 """Who slows down by less only coasts."""
-UNDECIDED_S = 4.0
-"""Who ends with a shorter time to collision has not avoided one yet."""
-BEFORE, AFTER, LEFT, FEWEST = 20, 40, 5, 40
-"""Steps shown before the onset, at most after a crash, and when all is over; and at least up to the crash."""
+UNDECIDED_S, STILL_MPS = 4.0, 0.05
+"""Who ends with a shorter time to collision, and faster, has not avoided one yet."""
+BEFORE, LEFT, FEWEST = 20, 5, 40
+"""Steps shown before the onset, and when all is over; and at least up to the crash."""
 
 Scene = dict[str, Any]
 """What the script reads. Moments are steps of the episode, positions (m) and speeds (m/s) those from ``first`` on."""
@@ -247,8 +247,8 @@ def _last_shown(crash: int, end: int, v: FloatArray, v_bv: FloatArray) -> int:
     until = end
     if end < 0:
         safe = np.flatnonzero(v[crash:] <= v_bv[crash:])
-        until = crash + int(safe[0]) if safe.size else crash + AFTER
-    return int(min(max(until, crash), crash + AFTER, v_bv.size - 1 - LEFT)) + LEFT
+        until = crash + int(safe[0]) if safe.size else v_bv.size - 1
+    return int(min(max(until, crash), v_bv.size - 1 - LEFT)) + LEFT
 
 
 def _brakes(v: FloatArray, first: int) -> int | None:
@@ -306,7 +306,7 @@ def _ending(track: Scene, scene: Scene) -> str:
         if closest < 0.0:
             return f"touches {bv['name']} at {tenths(_closing(track, bv, nearest))} m/s, too softly to count"
         gap = f"{tenths(closest)} m" if closest >= 0.05 else "< 0.1 m"
-        if (rate := _closing(track, bv, end)) > 0.0 and _gap(track, bv, end) < rate * UNDECIDED_S:
+        if (rate := _closing(track, bv, end)) > STILL_MPS and _gap(track, bv, end) < rate * UNDECIDED_S:
             return f"no crash until the test ends, {gap} behind {bv['name']} and still {tenths(rate)} m/s faster"
         return f"avoids it, {gap} at the closest" + f" since {family.words.since}" * bool(scene["onset"] < cut)
     contact = crash - first

@@ -112,10 +112,9 @@ def family_rows(content: Mapping[str, Any]) -> Iterator[tuple[str, ...]]:
             low, high = family["ci_low"], family["ci_high"]
             far = high is not None and high >= FAR_APART * low
             rate = f"{number(per_hour)} (≥ {number(low)})" if high is None else interval(low, high, per_hour)
+            part = share(family["share"])
             if far:  # what is known is a limit
                 rate = f"< {number(high)} (est. {number(per_hour)})"
-            elif family["share"] is not None:
-                part = share(family["share"])
             if (times := family["ratio"]) is not None:
                 least, most = number(family["ratio_low"], 2), number(family["ratio_high"], 2)
                 ends = f"≥ {least}" if family["ratio_high"] is None else f"{least}–{most}"

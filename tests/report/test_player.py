@@ -337,3 +337,11 @@ def test_without_its_extra_or_a_screen_the_gui_is_refused_in_words(stored_run, m
     monkeypatch.delenv("DISPLAY", raising=False)
     with pytest.raises(CampaignError, match="DISPLAY is not set"):
         gui_program()
+
+
+def test_another_driver_is_shown_until_it_no_longer_closes_in_however_long_that_takes():
+    """Its ending is told by what is shown: one that brakes gently behind a standing vehicle has not stopped in 4 s."""
+    v, standing = np.maximum(30.0 - 0.25 * np.arange(200), 0.0), np.zeros(200)
+    assert player._last_shown(10, -1, v, standing) == 120 + player.LEFT
+    assert player._last_shown(10, 60, v, standing) == 60 + player.LEFT
+    assert player._last_shown(10, -1, v[:100], standing[:100]) == 99
