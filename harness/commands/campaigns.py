@@ -225,7 +225,11 @@ def compare(
             b = harness.load_campaign(source_b, [*overrides, *against], av=av)
     if stored is not None:  # the precision of the stored run is not what is asked for now
         a = a.model_copy(update={"stop": b.stop})
-    (vehicle_a, _), (vehicle_b, _) = vehicle_words(a.av), vehicle_words(b.av)
+    # A driver by its name, as brakes-8, has the name of its campaign; its model is that of others, too.
+    vehicle_a, vehicle_b = (
+        each.name if each.av.model and not names_a_campaign(source) else vehicle_words(each.av)[0]
+        for each, source in ((a, file_a), (b, source_b))
+    )
     name_b = ", ".join(against) if file_b is None else b.name
     if vehicle_a != vehicle_b:
         labels = vehicle_a, vehicle_b
