@@ -31,7 +31,7 @@ from harness.campaign.python_files import (
 )
 from harness.campaign.vehicle import AutomatedVehicle
 from harness.controllers.hosts import BatchHost, BeforeTest, ControllerHost, Guard, VehicleHost, cause_of, death_cause
-from harness.controllers.traci_style import StepListenerController
+from harness.controllers.traci_style import WAITS, StepListenerController
 from harness.errors import EXIT_TOO_MANY_FAILED, CampaignError, HarnessError
 from harness.files import real_path
 from harness.problems import did_you_mean, nearest
@@ -333,10 +333,7 @@ def tried_script(av: AutomatedVehicle) -> TriedScript | None:
     step_s = STEP_S * (every or 1)
     if (idle_s := idle * step_s) > MOST_IDLE_S:
         found, expected = f"{name}, which looks at no vehicle for {idle_s:.0f} s", "a script that drives from its start"
-        mend = (
-            "A test is one run of it from its first line, for up to 20 s: leave out steps that only wait, or set the "
-        )
-        raise CampaignError("av.controller", found, expected, mend + "option that does: --set av.parameters.NAME=…")
+        raise CampaignError("av.controller", found, expected, WAITS)
     return TriedScript(step_s, idle_s, left * step_s)
 
 

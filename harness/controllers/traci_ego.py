@@ -21,6 +21,7 @@ from harness.campaign.vehicle import AutomatedVehicle
 from harness.controllers.hosts import Guard, cause_of
 from harness.controllers.protocol import EpisodeStart, Neighbour, Observation
 from harness.controllers.traci_script import ScriptController, ScriptTraci, TraciScript
+from harness.controllers.traci_style import WAITS
 from harness.controllers.traci_vehicle import DECEL, VEH_ID, SeenVehicle, VehicleDomain
 from harness.errors import CampaignError
 from harness.vehicles.kinematics import STEP_S, VEHICLE_LENGTH_M
@@ -68,8 +69,7 @@ def _unusable(name: str, wrong: str, ego: str | None) -> CampaignError:
     """The error of a script with which something is ``wrong``, and how to mend it."""
     expected, mend = "a script that commands one vehicle", "Name its vehicle: --set av.traci_style.ego=NAME."
     if wrong.startswith((NEVER_DRIVES, COMMANDS_NONE)):
-        mend = "A test is one run of it from its first line: leave out steps that only wait. If it drives later, "
-        mend += f"--set av.traci_style.ego={ego or 'NAME'}."
+        mend = f"{WAITS}. If it drives later, --set av.traci_style.ego={ego or 'NAME'}."
     if wrong.startswith(FAILS):
         expected = "a script that gets through a cut-in"
         mend, line = "Fix the script in that line.", re.search(r":(\d+)\)", wrong)

@@ -21,6 +21,11 @@ from harness.controllers.traci_vehicle import VEH_ID, VehicleDomain
 from harness.vehicles.kinematics import STEP_S
 
 __all__ = ["StepListenerController", "TraCIException", "TraciStyleController"]
+WAITS = (
+    "A test is one run of it from its first line: leave out steps that only wait, or set its option for that, "
+    "--set av.parameters.NAME=…"
+)
+"""What to do about a script that waits."""
 
 
 class SimulationDomain(Domain):
