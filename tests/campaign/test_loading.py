@@ -70,6 +70,7 @@ BROKEN_RULES = (
     ("scenario: all", "scenario", 2, "Write scenarios: [cut_in, lead_brakes, cut_out]"),
     ("scenarios: [cut_in, lead_brakes]\nexposure: {lead: 0.3}", "exposure.lead", 3, "Did you mean 'lead_brakes'"),
     ("scenarios:\n  - cut_in\n  - cutout", "scenarios.1", 4, "Did you mean 'cut_out'"),
+    ("scenario: cut_out\nscenarios: [cut_in, lead_brakes]", "scenario", 2, "Delete one of both keys"),
     ("environment:\n  parameters: gone.yaml", "environment.parameters", 3, "a parameter file"),
     ("av:\n  sumo: {tau: 1}\nworld: {engine: twin}", "world.engine", 4, "Write engine: sumo"),
     ("av:\n  traci: {command: 'x {host}'}", "av.traci.command", 3, "Double a brace"),

@@ -156,6 +156,8 @@ def test_other_exposures_need_no_new_tests(run, capsys):
     assert {key: of for key, of in again.items() if key != "crc32"} == told
     assert main(["estimate", str(run.folder), "--exposure", "lane_change=0.3"]) == 2
     assert "cut_in, lead_brakes, cut_out" in capsys.readouterr().err
+    assert main(["estimate", str(run.folder), "-e", "nade"]) == 2
+    assert f"Name {run.folder / 'cut_in'}, say." in " ".join(capsys.readouterr().err.split())
     assert main(["estimate", str(run.folder), "--exposure", "lead_brakes=1,cut_in=2"]) == 2
     assert "Write --exposure lead_brakes=0.1, once for each; or" in capsys.readouterr().err
     given = ["--exposure", "cut_in=0.1", "--exposure-uncertainty"]
