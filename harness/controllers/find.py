@@ -151,6 +151,11 @@ def _script(av: AutomatedVehicle, guard: Guard) -> Callable[[], Any] | None:
         found, mend = f"{name}, which does not import traci", in_python_file(name) or "Name its class: my_av.py:Class."
         raise CampaignError("av.controller", found, "a TraCI script, or a class or function of a file", mend)
     if not is_script(name):
+        file, function = file_and_function(name)
+        if is_script(file) and function not in re.findall(r"\w+", Path(file).read_text("utf-8", "replace")):
+            expected = "a function without arguments, or a class"  # importing it would start SUMO
+            mend = in_python_file(file) or f"Name the script itself: {file}."
+            raise CampaignError("av.controller", f"no {function} in {file}", expected, mend)
         return None
     from harness.controllers.traci_ego import script_maker  # noqa: PLC0415 - few campaigns have one
 

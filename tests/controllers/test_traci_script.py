@@ -12,7 +12,7 @@ import pytest
 
 from harness.campaign.files import load_campaign
 from harness.cli import main
-from harness.controllers.find import tried_script
+from harness.controllers.find import require_controller, tried_script
 from harness.controllers.traci_style import TraciStyleController
 from harness.errors import CampaignError
 from harness.report.acted import script_words
@@ -282,6 +282,14 @@ def test_a_script_that_first_waits_is_told_that_each_test_begins_with_its_first_
     assert tried["step_s"] == 0.1
     assert told in (said := " ".join(script_words(tried)))
     assert bool(told) == bool(said)
+
+
+@pytest.mark.parametrize(("body", "mend"), [("", "the script itself"), ("def drive(): pass\n", r"my\.py:drive")])
+def test_a_function_that_a_script_lacks_is_told_without_running_it(body, mend, tmp_path):
+    (tmp_path / "my.py").write_text(f"import traci\n{body}raise RuntimeError\n", "utf-8")
+    with pytest.raises(CampaignError, match=rf"no driv in .*my\.py; .*{mend}") as refused:
+        require_controller(load_campaign(f"{tmp_path}/my.py:driv").av)
+    assert "RuntimeError" not in str(refused.value)
 
 
 def test_a_script_that_waits_for_most_of_a_test_is_refused_also_where_its_vehicle_is_named(tmp_path):
