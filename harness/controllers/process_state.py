@@ -77,6 +77,9 @@ class OtherModules:
             for key in [key for key, value in content.items() if vars(place).get(key, self) is not value]:
                 setattr(place, key, content[key])
                 changed.append(f"{name}.{key}")
+        if sys.excepthook is None:  # a library's own is nobody's concern; without any no thread starts
+            sys.excepthook = sys.__excepthook__
+            changed.append("sys.excepthook")
         return changed
 
 

@@ -235,6 +235,7 @@ def test_check_refuses_what_run_refuses_and_makes_nothing_but_controllers(av, wh
         "io.BytesIO",
         "hashlib.sha256",
         "pathlib.Path.read_bytes",
+        "sys.excepthook",
     ],
 )
 def test_one_that_replaces_what_the_harness_calls_is_named(what, at, tmp_path, capsys):
