@@ -106,7 +106,11 @@ REFUSED = {
     "flicker": (flickering, "come back within a second"),
     "few": (
         lambda: ROWS[ROWS.recording_id < 12],
-        r"\(of 12 in all\), in [\d.]+ vehicle-hours beside.*at least 20.*hours are needed",
+        r"\(of 12 in all; to the left 0\), in [\d.]+ vehicle-hours beside.*at least 20.*hours are needed",
+    ),
+    "changes to the other side": (
+        lambda: ROWS.assign(lane=ROWS.lane.where(ROWS.vehicle_id != 1, 1 - ROWS.lane)),
+        r"\(of 0 in all; to the left 30\), .*change to the left: number lanes as they lie",
     ),
     "congested": (congested, "outside the fit range"),
     "nobody closes in": (lambda: ROWS[ROWS.vehicle_id != 2].query("vehicle_id < 2"), "beside it|closes? in"),

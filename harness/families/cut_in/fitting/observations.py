@@ -74,6 +74,8 @@ class BesideCounts(NamedTuple):
     flickers: int = 0
     changes: int = 0
     """Lane changes to the target lane."""
+    changes_other: int = 0
+    """Those to the other side."""
     used: int = 0
     """Of those, behind a leader within the fit range and beside nobody."""
     odd: int = 0
@@ -153,6 +155,7 @@ def observe(track: Recording) -> Observations:
         overlapping_s=float(duration_s[overlaps].sum()),
         flickers=track.flickers,
         changes=changes.size,
+        changes_other=np.count_nonzero(track.crosses(1) & track.fitted),
         used=int((at_risk & crosses).sum()),
         odd=odd,
         closing_s=float(near.size),
@@ -263,8 +266,10 @@ def require_enough(observations: Sequence[Observations], where: str, mapping: Ma
          side if total.closing_other_s > total.closing_s else "Use recordings in which vehicles overtake.", "lane", ""),
         (total.used < FEWEST_CHANGES,
          f"{total.used} lane changes to the {to} behind a leader within the fit range (of {total.changes} in "
-         f"all), in {hours:.1f} vehicle-hours beside that lane",
-         f"at least {FEWEST_CHANGES}", f"Add recordings: {needed}.", "", ""),
+         f"all; to the {other} {total.changes_other}), in {hours:.1f} vehicle-hours beside that lane",
+         f"at least {FEWEST_CHANGES}, ahead of vehicles that close in there",
+         f"Add recordings: {needed}." if total.changes_other < FEWEST_CHANGES or total.changes else
+         f"Vehicles close in to the {to}, and change to the {other}: number lanes as they lie.", "", ""),
     ]  # fmt: skip
     for broken, *problem in rules:
         if broken:
