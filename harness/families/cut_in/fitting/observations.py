@@ -155,7 +155,7 @@ def observe(track: Recording) -> Observations:
         overlapping_s=float(duration_s[overlaps].sum()),
         flickers=track.flickers,
         changes=changes.size,
-        changes_other=np.count_nonzero(track.crosses(1) & track.fitted),
+        changes_other=int(np.count_nonzero(track.crosses(1) & track.fitted)),
         used=int((at_risk & crosses).sum()),
         odd=odd,
         closing_s=float(near.size),
