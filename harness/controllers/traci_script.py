@@ -350,6 +350,7 @@ class ScriptController:
         with suppress(ScriptError):  # the last test's
             self.close()
         self.traci = ScriptTraci(self._vehicle(episode.set_speed_mps, episode.lv_name, episode.bv_name))
+        self._path = [*sys.path]  # which scripts append to, each run again
         self._left, seed = 0, partial(episode.random.integers, 2**63)
         self._run = greenlet(partial(self._script.run, self.traci, lambda: int(seed())))
 
@@ -368,11 +369,11 @@ class ScriptController:
 
     def _turn(self) -> None:
         assert self._run is not None
-        argv, sys.argv = sys.argv, self._script.argv
+        (argv, sys.argv), (path, sys.path) = (sys.argv, self._script.argv), (sys.path, self._path)
         try:
             self._run.switch()
         finally:
-            sys.argv = argv
+            sys.argv, sys.path = argv, path
         if RefusedError.last is not None:
             raise RefusedError.last
         self.traci.require_unfinished(dead=self._run.dead)

@@ -17,8 +17,8 @@ import numpy as np
 from harness.campaign.campaign import Campaign
 from harness.campaign.vehicle import AutomatedVehicle
 from harness.controllers.clock import Clock
-from harness.controllers.find import build_host, has_foreign_code, run_apart
-from harness.errors import HarnessError
+from harness.controllers.find import AvEndedProcessError, build_host, has_foreign_code, run_apart
+from harness.errors import CampaignError
 from harness.loop.loop import EpisodeLoop, RecordPolicy, Scenario, Shard, hash_of_index
 from harness.loop.repeat import Traffic
 from harness.records.folder import Repeated
@@ -91,7 +91,7 @@ def _each_elsewhere(source: Source, tests: list[DrawnTests]) -> list[Bits | None
     """Bits of each test; None where it ends its process, or its controller cannot be made once more."""
     try:
         return [*run_elsewhere(source, tests).bits]
-    except (HarnessError, OSError):
+    except (AvEndedProcessError, CampaignError, OSError):
         half = len(tests) // 2
         return [None] if not half else _each_elsewhere(source, tests[:half]) + _each_elsewhere(source, tests[half:])
 

@@ -3,6 +3,7 @@
 import json
 import re
 import shutil
+import sys
 from contextlib import closing
 from pathlib import Path
 
@@ -290,6 +291,17 @@ def test_a_function_that_a_script_lacks_is_told_without_running_it(body, mend, t
     with pytest.raises(CampaignError, match=rf"no driv in .*my\.py; .*{mend}") as refused:
         require_controller(load_campaign(f"{tmp_path}/my.py:driv").av)
     assert "RuntimeError" not in str(refused.value)
+
+
+def test_what_a_script_adds_to_the_path_ends_with_its_run(tmp_path):
+    """After thousands of tests no process could be started with it, and tests counted as not reproducible."""
+    (tmp_path / "lib").mkdir()
+    (tmp_path / "lib/own_speed.py").write_text("MPS = 20.0\n")
+    path = f"import sys\nsys.path.append({str(tmp_path / 'lib')!r})\nimport own_speed\n"
+    (tmp_path / "my.py").write_text(path + text("traci.vehicle.setSpeed('ego', own_speed.MPS)"), "utf-8")
+    shard = drive(f"av={{controller: '{tmp_path}/my.py'}}", HELD, n=12)
+    assert shard.failures == {}
+    assert str(tmp_path / "lib") not in sys.path
 
 
 def test_a_script_that_waits_for_most_of_a_test_is_refused_also_where_its_vehicle_is_named(tmp_path):
