@@ -292,7 +292,9 @@ def read_manifest(folder: Path, *, mend: str = NO_RUN) -> dict[str, Any]:
     if not path.exists():
         expected = "a run folder, which holds a manifest.json"
         if runs := sorted(folder.glob("*/" + MANIFEST)) or sorted(folder.glob("*/*/" + MANIFEST)):
-            mend = f"Name one, such as {runs[0].parent}. If it is not finished, `harness run` with --resume goes on."
+            compared = {run.parent.name for run in runs} == {"a", "b"}
+            again = "the same `harness compare`" if compared else "`harness run` with --resume"
+            mend = f"Name one, such as {runs[0].parent}. If it is not finished, {again} goes on."
             raise RunFolderError(str(folder), "a folder of several runs", "the run folder of one", mend)
         raise RunFolderError(str(path), "no such file: this is no run folder", expected, mend)
     manifest = read_as(StoredManifest, path, mend=mend)

@@ -187,7 +187,7 @@ def warnings_of(scenario: str, result: Mapping[str, Any], unit: str, but: str = 
         failed = f"{count(n)} of {n_tests} tests FAILED"
         yield f"{failed}; had they all crashed, as upper limits assume, the rate would be {rate}{why}"
     worst = result["rate"] + result["cut_off"]
-    if worst > max((1.0 + CUT_OFF_SHARE) * result["rate"], result["ci_high"]):
+    if _cut_off_counts(worst, result["rate"], result["ci_high"]):
         ended = f"tests, as test {result['cut_off_test']}, ended while the vehicle was still closing in"
         yield f"{ended}; had all crashed: {number(worst)}{unit}{but}"
     touches = result.get("share_below_1_mps")
@@ -195,6 +195,11 @@ def warnings_of(scenario: str, result: Mapping[str, Any], unit: str, but: str = 
         left_out = f"crash.counts_above_mps={plain(TOUCH_MPS)} leaves them out"
         yield f"{share(touches)} of these crashes are touches below {plain(TOUCH_MPS)} m/s: {left_out}"
     yield from acted_words(scenario, result.get("before_event"))
+
+
+def _cut_off_counts(worst: float, rate: float, high: float) -> bool:
+    """Whether tests that were cut off matter: all as crashes, the rate would be ``worst``."""
+    return worst > max((1.0 + CUT_OFF_SHARE) * rate, high)
 
 
 def _warnings(campaign: Campaign, manifest: Mapping[str, Any], estimates: Estimates) -> Iterator[str]:
@@ -246,7 +251,11 @@ def _scope(campaign: Campaign, manifest: Mapping[str, Any], estimates: Estimates
         decision = estimates.decision
         ended = "all tests done" if decision is None else ended + go_on(best.n_episodes, best.n_crashes, decision)
     elif stopped_by == "pool" and campaign.accept is not None:
-        ended += remedy_words(manifest.get("remedy") or {"pool.events_per_shell": None})
+        more = remedy_words(manifest.get("remedy") or {"pool.events_per_shell": None})
+        worst = best.crash_rate + estimates.cut_off
+        ended += (
+            "; tests cut off count as crashes, see !" if _cut_off_counts(worst, best.crash_rate, best.ci_high) else more
+        )
     elif stopped_by in ("rhw", "below_reference") and campaign.testing.shells.statement != ASSUMPTION_FREE:
         ended += f", given the {campaign.testing.shells.statement}"
     test = family_named(campaign.scenario).words.test
