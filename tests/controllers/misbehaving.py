@@ -229,18 +229,6 @@ class Stops(IDM):
             os.kill(os.getpid(), signal.SIGSTOP)
 
 
-class LeavesTimer(IDM):
-    """Leaves a timer behind whose handler raises: while the harness computes, or in the next call."""
-
-    def step(self, seen):
-        def late(*_):
-            raise OSError("too late")
-
-        signal.signal(signal.SIGALRM, late)
-        signal.setitimer(signal.ITIMER_REAL, 1e-4)
-        return super().step(seen)
-
-
 class Replaces(IDM):
     """Puts nothing in place of a module, or of what it or a class of it holds; of the judge one that ends no test."""
 

@@ -14,9 +14,9 @@ from benchmarks.kills import orphans
 from harness.campaign.vehicle import Limits
 from harness.cli import main
 from harness.controllers.find import build_host
-from harness.controllers.hosts import Guard, _numbers, optional
+from harness.controllers.hosts import Guard, _numbers, optional, require_ours
 from harness.controllers.protocol import Neighbour
-from harness.errors import EXIT_BAD_INPUT, EXIT_DONE, EXIT_TOO_MANY_FAILED
+from harness.errors import EXIT_BAD_INPUT, EXIT_DONE, EXIT_TOO_MANY_FAILED, CampaignError
 from harness.printed import PRINTED
 from harness.runner.workers import LocalWorkers
 from tests.controllers.misbehaving import Learned
@@ -246,9 +246,19 @@ def test_one_that_replaces_what_the_harness_calls_is_named(what, at, tmp_path, c
     assert (tmp_path / "run").exists() == (at == "step")
 
 
-def test_one_that_leaves_a_timer_whose_handler_raises_is_named(tmp_path, capsys):
-    assert _run(tmp_path, _of("LeavesTimer")) == EXIT_BAD_INPUT
-    assert "found:    a vehicle that raises between its calls: OSError: too late" in capsys.readouterr().err
+def test_what_the_users_code_raises_between_its_calls_is_named_and_our_own_errors_are_not():
+    """As the handler of a timer that it has left."""
+
+    def late(*_):
+        raise OSError("too late")
+
+    with pytest.raises(OSError, match="too late") as raised:
+        late()
+    with pytest.raises(
+        CampaignError, match=r"a vehicle that raises between its calls: OSError: too late \(test_faults"
+    ):
+        require_ours(raised.value)
+    require_ours(ValueError("of the harness, without a line of theirs"))
 
 
 @pytest.mark.parametrize(
