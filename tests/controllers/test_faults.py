@@ -254,9 +254,7 @@ def test_what_the_users_code_raises_between_its_calls_is_named_and_our_own_error
 
     with pytest.raises(OSError, match="too late") as raised:
         late()
-    with pytest.raises(
-        CampaignError, match=r"that raises between its calls: OSError: too late \(test_faults"
-    ):
+    with pytest.raises(CampaignError, match=r"that raises between its calls: OSError: too late \(test_faults"):
         require_ours(raised.value)
     require_ours(ValueError("of the harness, without a line of theirs"))
 
