@@ -250,9 +250,8 @@ def pair_warnings(content: Mapping[str, Any]) -> Iterator[str]:
     sides: dict[str, list[str]] = {}
     for name in "AB":
         side = content[name.lower()]
-        for text in (
-            sum_warnings({**side, "readings": ()}) if "families" in content else _warnings_of_side(content, side)
-        ):
+        of_sum = "families" in content
+        for text in sum_warnings({**side, "readings": ()}) if of_sum else _warnings_of_side(content, side):
             sides.setdefault(text, []).append(name)
     yield from (f"{' and '.join(names)}{',' if 'families' in content else ':'} {text}" for text, names in sides.items())
     if where := content.get("unseen"):

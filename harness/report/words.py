@@ -186,10 +186,9 @@ def warnings_of(scenario: str, result: Mapping[str, Any], unit: str, but: str = 
         why = f"; most with: {result['failure']}" if result.get("failure") else ""
         failed = f"{count(n)} of {n_tests} tests FAILED"
         yield f"{failed}; had they all crashed, as upper limits assume, the rate would be {rate}{why}"
-    worst = result["rate"] + result["cut_off"]
-    if _cut_off_counts(worst, result["rate"], result["ci_high"]):
+    if _cut_off_counts(result["rate"], result["cut_off"], result["ci_high"]):
         ended = f"tests, as test {result['cut_off_test']}, ended while the vehicle was still closing in"
-        yield f"{ended}; had all crashed: {number(worst)}{unit}{but}"
+        yield f"{ended}; had all crashed: {number(result['rate'] + result['cut_off'])}{unit}{but}"
     touches = result.get("share_below_1_mps")
     if touches is not None and touches > 0.5:
         left_out = f"crash.counts_above_mps={plain(TOUCH_MPS)} leaves them out"
@@ -197,9 +196,9 @@ def warnings_of(scenario: str, result: Mapping[str, Any], unit: str, but: str = 
     yield from acted_words(scenario, result.get("before_event"))
 
 
-def _cut_off_counts(worst: float, rate: float, high: float) -> bool:
-    """Whether tests that were cut off matter: all as crashes, the rate would be ``worst``."""
-    return worst > max((1.0 + CUT_OFF_SHARE) * rate, high)
+def _cut_off_counts(rate: float, cut_off: float, high: float) -> bool:
+    """Whether tests that were cut off, with a rate of their own, matter beside those that crashed."""
+    return rate + cut_off > max((1.0 + CUT_OFF_SHARE) * rate, high)
 
 
 def _warnings(campaign: Campaign, manifest: Mapping[str, Any], estimates: Estimates) -> Iterator[str]:
@@ -251,11 +250,10 @@ def _scope(campaign: Campaign, manifest: Mapping[str, Any], estimates: Estimates
         decision = estimates.decision
         ended = "all tests done" if decision is None else ended + go_on(best.n_episodes, best.n_crashes, decision)
     elif stopped_by == "pool" and campaign.accept is not None:
-        more = remedy_words(manifest.get("remedy") or {"pool.events_per_shell": None})
-        worst = best.crash_rate + estimates.cut_off
-        ended += (
-            "; tests cut off count as crashes, see !" if _cut_off_counts(worst, best.crash_rate, best.ci_high) else more
-        )
+        if _cut_off_counts(best.crash_rate, estimates.cut_off, best.ci_high):
+            ended += "; tests cut off count as crashes, see !"
+        else:
+            ended += remedy_words(manifest.get("remedy") or {"pool.events_per_shell": None})
     elif stopped_by in ("rhw", "below_reference") and campaign.testing.shells.statement != ASSUMPTION_FREE:
         ended += f", given the {campaign.testing.shells.statement}"
     test = family_named(campaign.scenario).words.test
