@@ -19,6 +19,7 @@ from typing import Any
 WATCHED = (
     *("builtins", "functools", "hashlib", "io", "math", "json", "os", "pickle", "signal", "struct", "time", "zlib"),
     *("pathlib", "numpy", "pyarrow", "pyarrow.compute", "pyarrow.parquet"),
+    *("multiprocessing.connection", "multiprocessing.reduction"),
 )
 OURS = "harness", "numba", "llvmlite", "numpy"
 """Packages of which no module may be replaced."""
@@ -64,19 +65,24 @@ class OtherModules:
         watched = [name for name in self._loaded if name in WATCHED or name.partition(".")[0] == OURS[0]]
         places: dict[str, Any] = {name: self._loaded[name] for name in watched}
         types = [cls for module in places.values() for cls in vars(module).values() if isinstance(cls, type)]
-        ours = [cls for cls in types if cls.__module__.partition(".")[0] in (OURS[0], "pathlib")]
+        packages = OURS[0], "pathlib", "multiprocessing"
+        ours = [cls for one in types for cls in one.__mro__ if cls.__module__.partition(".")[0] in packages]
         places |= {f"{cls.__module__}.{cls.__qualname__}": cls for cls in ours}
-        self._kept = {name: (place, _called_or_read(vars(place))) for name, place in places.items()}
+        self._kept = {name: (place, _called_or_read(vars(place)), set(vars(place))) for name, place in places.items()}
 
     def restored(self) -> list[str]:
         """Put all back; names, as ``math`` or ``math.sqrt``, that had been replaced or deleted."""
         gone = {name: module for name, module in self._loaded.items() if sys.modules.get(name) is not module}
         changed = [name for name in gone if name in WATCHED or name.partition(".")[0] in OURS]
         sys.modules |= {name: module for name, module in gone.items() if name in changed or name not in sys.modules}
-        for name, (place, content) in self._kept.items():
-            for key in [key for key, value in content.items() if vars(place).get(key, self) is not value]:
+        for name, (place, content, before) in self._kept.items():
+            replaced = [key for key, value in content.items() if vars(place).get(key, self) is not value]
+            hides = [key for key in vars(place).keys() - before if _inherits(place, key)]
+            for key in replaced:
                 setattr(place, key, content[key])
-                changed.append(f"{name}.{key}")
+            for key in hides:
+                delattr(place, key)
+            changed += [f"{name}.{key}" for key in replaced + hides]
         if sys.excepthook is None:  # a library's own is nobody's concern; without any no thread starts
             sys.excepthook = sys.__excepthook__
             changed.append("sys.excepthook")
@@ -95,4 +101,9 @@ def closed_to_files() -> str:
 
 
 def _called_or_read(names: dict[str, Any]) -> dict[str, Any]:
-    return {k: v for k, v in names.items() if k[:2] != "__" and (callable(v) or type(v) in (float, type(sys)))}
+    kinds = float, type(sys), classmethod, staticmethod, property
+    return {k: v for k, v in names.items() if k[:2] != "__" and (callable(v) or type(v) in kinds)}
+
+
+def _inherits(place: Any, name: str) -> bool:
+    return isinstance(place, type) and any(name in vars(base) for base in place.__mro__[1:])
