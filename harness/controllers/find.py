@@ -310,12 +310,14 @@ class TriedScript(NamedTuple):
     """What a TraCI script does when it is tried: for 15 s, in which a car cuts in, and then drives ahead.
 
     ``step_s`` is the step that it asks for. It is ``idle_s``, looking at no vehicle, before it begins; and ``left_s``
-    is how long, with somebody ahead, it gives no command, so that SUMO's own model would drive.
+    is how long, with somebody ahead, it gives no command, so that SUMO's own model would drive. ``safe_speeds``: its
+    speed mode is SUMO's own, in which safe speeds would bound its commands.
     """
 
     step_s: float
     idle_s: float
     left_s: float
+    safe_speeds: bool
 
 
 def tried_script(av: AutomatedVehicle) -> TriedScript | None:
@@ -324,14 +326,14 @@ def tried_script(av: AutomatedVehicle) -> TriedScript | None:
         return None
     from harness.controllers.traci_ego import asked_for  # noqa: PLC0415 - few campaigns have one
 
-    (every, hardest, idle, left), bound = run_apart(av, asked_for, av), av.traci_style.decel_mps2
+    (every, hardest, idle, left, safe), bound = run_apart(av, asked_for, av), av.traci_style.decel_mps2
     file = real_path(file_and_function(name)[0]).name
     if not every:
         note = "names no --step-length, nor does its .sumocfg: it is asked every 0.1 s, where SUMO would ask every 1 s"
         _tell_once(f"{file} {note}")
     if math.isinf(hardest):
         note = "sets a speed mode in which no decel bounds its braking, and a test fails where it is beyond av.limits"
-        _tell_once(f"{file} {note}; for a bound use mode 31, and --set av.traci_style.decel_mps2=8, say")
+        _tell_once(f"{file} {note}; for a bound use mode 30, and --set av.traci_style.decel_mps2=8, say")
     elif hardest > bound and "decel_mps2" not in av.traci_style.model_fields_set:
         note = f"asks for harder braking than {bound:g} m/s², the decel of SUMO's default type, and gets that"
         _tell_once(f"{file} {note}; of another type: --set av.traci_style.decel_mps2=8, say")
@@ -339,7 +341,7 @@ def tried_script(av: AutomatedVehicle) -> TriedScript | None:
     if (idle_s := idle * step_s) > MOST_IDLE_S:
         found, expected = f"{name}, which looks at no vehicle for {idle_s:.0f} s", "a script that drives from its start"
         raise CampaignError("av.controller", found, expected, WAITS)
-    return TriedScript(step_s, idle_s, left * step_s)
+    return TriedScript(step_s, idle_s, left * step_s, safe)
 
 
 def _sources_of_made(av: AutomatedVehicle) -> str | None:

@@ -22,7 +22,7 @@ from harness.controllers.hosts import Guard, cause_of
 from harness.controllers.protocol import EpisodeStart, Neighbour, Observation
 from harness.controllers.traci_script import ScriptController, ScriptTraci, TraciScript
 from harness.controllers.traci_style import WAITS
-from harness.controllers.traci_vehicle import DECEL, VEH_ID, SeenVehicle, VehicleDomain
+from harness.controllers.traci_vehicle import DECEL, SAFE_SPEED, VEH_ID, SeenVehicle, VehicleDomain
 from harness.errors import CampaignError
 from harness.vehicles.kinematics import STEP_S, VEHICLE_LENGTH_M
 
@@ -143,6 +143,11 @@ class _Tried(VehicleDomain):
 
     getAccel, getDecel = staticmethod(lambda _: 2.6), staticmethod(lambda _: 4.5)  # of SUMO's default type
 
+    @property
+    def safe(self) -> bool:
+        """Whether SUMO's safe speeds would bound what it commands."""
+        return bool(self._speed_mode & SAFE_SPEED)
+
     def next_acceleration(self) -> float:
         told = [*islice(self._plan, 1)]
         own, others = self._own, (self._lv, self._bv)
@@ -204,8 +209,8 @@ def _commanded(script: TraciScript, ego: str) -> tuple[_Tried, str]:
     return tried, ""
 
 
-def asked_for(av: AutomatedVehicle) -> tuple[int, float, int, int]:
-    """Steps of the harness in one that a script asks for, 0 if none; ``hardest``, ``idle`` and ``left`` of `_Tried`."""
+def asked_for(av: AutomatedVehicle) -> tuple[int, float, int, int, bool]:
+    """Steps of the harness in one of a script, 0 if it says none; ``hardest``, ``idle``, ``left``, ``safe`` of `_Tried`."""
     script, ego = TraciScript(str(av.controller), dict(av.parameters)), av.traci_style.ego
     tried = _Tried(ego or _AnyName(VEH_ID))
     controller = ScriptController(script, lambda *_: tried)
@@ -217,7 +222,7 @@ def asked_for(av: AutomatedVehicle) -> tuple[int, float, int, int]:
         else:
             answer, _ = guard.call(_commanded, script, ego, makes=True)
             tried = answer[0] if answer else tried
-    return controller.traci.every, tried.hardest, tried.idle, tried.left
+    return controller.traci.every, tried.hardest, tried.idle, tried.left, tried.safe
 
 
 def _drive(controller: ScriptController, n_steps: int = 150) -> None:

@@ -17,9 +17,9 @@ ROAD = "cell0"
 LANE_CENTRES_M = (-1.6, 1.6)
 MAX_SPEED_MPS = 100.0
 _ROUNDING = 1e-9
-_SAFE_SPEED, _ACCEL, DECEL = 1, 2, 4
+SAFE_SPEED, _ACCEL, DECEL = 1, 2, 4
 """Bits of a speed mode."""
-LOOSE = ": the script has set speed mode {}, in which decel does not bound setSpeed; use mode 31, or bound it yourself"
+LOOSE = ": the script has set speed mode {}, in which decel does not bound setSpeed; use mode 30, or bound it yourself"
 _SUMOS_OWN = 31
 """The speed mode of a script that sets none."""
 _CHANGES_LANE = 0b1100_1111_1111
@@ -101,7 +101,7 @@ class VehicleDomain(Domain):
         self._commanded_mps = math.nan
         """Speed (m/s) that the AV will have if it does what it is told."""
         self._accel = self._decel = math.inf
-        self._speed_mode = _ACCEL | DECEL
+        self._speed_mode = _SUMOS_OWN
         self._subscribed: dict[str, tuple[int, ...]] = {}
         self._around: dict[str, dict[float, tuple[int, ...]]] = {}
         """Range (m) and variables of what has been subscribed to around a vehicle."""
@@ -294,7 +294,7 @@ class VehicleDomain(Domain):
     def setSpeedMode(self, vehID: str, speedMode: int) -> None:
         """Whether `setAccel` (bit 2) and `setDecel` (bit 4) bound commands."""
         self._require_own(vehID, "setSpeedMode")
-        if speedMode & _SAFE_SPEED and speedMode != _SUMOS_OWN:
+        if speedMode & SAFE_SPEED and speedMode != _SUMOS_OWN:
             why = "SUMO's safe speeds (bit 1) do not bound the AV here: what it is told it does, as under speed mode 32"
             raise RefusedError(f"vehicle.setSpeedMode('{vehID}', {speedMode}) is refused: {why}.")
         self._speed_mode = speedMode

@@ -179,7 +179,7 @@ IN_A_TEST = {
         "if leader:\n        try: traci.vehicle.setAcceleration('ego', -traci.vehicle.getTau('ego'), 0.1)\n"
         "        except Exception: pass"
     ),
-    r"step: asked for -\d+\.?\d* m/s2, outside of av.limits \(-15 to 10\) \(my.py:7\): .* mode 0, .* use mode 31": text(
+    r"step: asked for -\d+\.?\d* m/s2, outside of av.limits \(-15 to 10\) \(my.py:7\): .* mode 0, .* use mode 30": text(
         "if leader: traci.vehicle.setSpeedMode('ego', 0), traci.vehicle.setSpeed('ego', 0.0)"
     ),
 }
@@ -279,9 +279,9 @@ def test_a_script_that_first_waits_is_told_that_each_test_begins_with_its_first_
     keeps = "traci.vehicle.setSpeed('ego', traci.lane.getMaxSpeed(traci.vehicle.getLaneID('ego')))"
     body = text(keeps, LOOP.replace("while", waits)).replace('"sumo"', '"sumo", "--step-length", "0.1"')
     (tmp_path / f"my{steps}.py").write_text(body, "utf-8")
-    tried = tried_script(load_campaign(str(tmp_path / f"my{steps}.py")).av)._asdict()
-    assert tried["step_s"] == 0.1
-    assert told in (said := " ".join(script_words(tried)))
+    tried = tried_script(load_campaign(str(tmp_path / f"my{steps}.py")).av)
+    assert tried.step_s == 0.1
+    assert told in (said := " ".join(script_words(tried._replace(safe_speeds=False)._asdict())))
     assert bool(told) == bool(said)
 
 
@@ -324,9 +324,18 @@ def test_a_script_that_leaves_the_vehicle_to_sumo_is_told_that_here_it_keeps_its
     (tmp_path / "my.py").write_text(body, "utf-8")
     tried = tried_script(load_campaign(str(tmp_path / "my.py")).av)
     assert tried.left_s == pytest.approx(left_s, abs=2.0)
-    assert [f"gives no command for {tried.left_s:.1f} s behind" in said for said in script_words(tried._asdict())] == (
-        [True] if left_s else []
-    )
+    said = list(script_words(tried._replace(safe_speeds=False)._asdict()))
+    assert [f"gives no command for {tried.left_s:.1f} s behind" in words for words in said] == [True] * bool(left_s)
+
+
+@pytest.mark.parametrize(("modes", "bounded"), [("", True), ("31", True), ("31 30", False), ("32", False)])
+def test_a_script_that_sumos_safe_speeds_would_hold_back_is_told_that_here_they_do_not(modes, bounded, tmp_path):
+    """A script that alone would never crash in SUMO may crash here."""
+    sets = "\n    ".join(f"traci.vehicle.setSpeedMode('ego', {mode})" for mode in modes.split())
+    (tmp_path / "my.py").write_text(text(f"{sets or 'pass'}\n    traci.vehicle.setSpeed('ego', 20.0)"), "utf-8")
+    tried = tried_script(load_campaign(str(tmp_path / "my.py")).av)
+    assert tried.safe_speeds == bounded
+    assert ["safe speeds would hold" in words for words in script_words(tried._asdict())] == [True] * bounded
 
 
 def test_a_stored_answer_is_the_same_when_the_script_has_gone_or_is_broken(tmp_path):
