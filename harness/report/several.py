@@ -233,16 +233,16 @@ def pair_words(decision: Mapping[str, Any], beside: Mapping[str, Any] | None = N
         seems = "less" if (least or 0.0) > 1.0 else "more" if (most or math.inf) < 1.0 else ""
         open_words = f"Not proven: B seems to crash {seems} often" if seems else "Not told apart"
         return verdicts.get(verdict, open_words) + ", see !" * bool(of_safer)
-    most = share(margin)
+    most, limit = share(margin), ratio(1.0 / (1.0 + margin))
     ends = decision.get("ratio") or (None, None)  # of B / A; told as all else, of A / B
     high, low = ("" if not end else ratio(1.0 / end) for end in ends)
     if verdict == "proven":
         safer = "B crashes less often than A, so it is" if (ends[1] or 1.0) < 1.0 else "B is"
-        return f"{safer} at most {most} worse than A" + f" (A / B ≥ {low})" * bool(low)
+        return f"{safer} at most {most} worse than A" + f" (A / B ≥ {low}, limit {limit})" * bool(low)
     if verdict == "refuted":
-        return f"B is more than {most} worse than A" + f" (A / B ≤ {high})" * bool(high)
+        return f"B is more than {most} worse than A" + f" (A / B ≤ {high}, limit {limit})" * bool(high)
     between = f"{low} to {high}" if low and high else f"≥ {low}" if low else f"≤ {high}"
-    return f"Open whether B is more than {most} worse than A" + f" (A / B {between})" * bool(low or high)
+    return f"Open whether B is more than {most} worse than A" + f" (A / B {between}, limit {limit})" * bool(low or high)
 
 
 def pair_warnings(content: Mapping[str, Any]) -> Iterator[str]:

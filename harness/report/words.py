@@ -28,6 +28,7 @@ from harness.numbers import (
     leaves,
     number,
     plain,
+    ratio,
     share,
     tests,
     two_digits_up,
@@ -130,7 +131,9 @@ def doubts_of(
 ) -> dict[str, Any]:
     """What may make the rate of a run doubtful, for `warnings_of`; rates are per test, multiplied by ``times``."""
     best, severity = estimates.best, estimates.severity
+    references = [each["crash_rate"] for each in best.details.get("references", ()) if each["crash_rate"] > 0.0]
     return {
+        "reference_rate": times * references[0] if references else None,
         EARLY: n_left_out(campaign, estimates.diagnostics.get(EARLY, 0)), "milder": estimates.milder,
         "if_failed_had_crashed": times * best.details["crash_rate_if_failed_had_crashed"],
         "cut_off": times * estimates.cut_off, "cut_off_test": estimates.cut_off_test,
@@ -182,18 +185,24 @@ def warnings_of(scenario: str, result: Mapping[str, Any], unit: str, but: str = 
         unseen = f"crashes there, up to {number(missed['rate'])}{unit}, are in no limit (pool.shadow_paths={n})"
         yield f"{n_runs} baseline runs may miss what it does in 1 of {drives} drives: {unseen}"
     if n := result["n_failed"]:
-        n_tests, rate = count(result["n_episodes"]), f"{number(result['if_failed_had_crashed'])}{unit}"
+        n_tests, rate = count(result["n_episodes"]), _supposed(result["if_failed_had_crashed"], unit, result)
         why = f"; most with: {result['failure']}" if result.get("failure") else ""
         failed = f"{count(n)} of {n_tests} tests FAILED"
         yield f"{failed}; had they all crashed, as upper limits assume, the rate would be {rate}{why}"
     if _cut_off_counts(result["rate"], result["cut_off"], result["ci_high"]):
         ended = f"tests, as test {result['cut_off_test']}, ended while the vehicle was still closing in"
-        yield f"{ended}; had all crashed: {number(result['rate'] + result['cut_off'])}{unit}{but}"
+        yield f"{ended}; had all crashed: {_supposed(result['rate'] + result['cut_off'], unit, result)}{but}"
     touches = result.get("share_below_1_mps")
     if touches is not None and touches > 0.5:
         left_out = f"crash.counts_above_mps={plain(TOUCH_MPS)} leaves them out"
         yield f"{share(touches)} of these crashes are touches below {plain(TOUCH_MPS)} m/s: {left_out}"
     yield from acted_words(scenario, result.get("before_event"))
+
+
+def _supposed(rate: float, unit: str, result: Mapping[str, Any]) -> str:
+    """A rate had more tests crashed, and how many times that of the competent driver it would be."""
+    reference = result.get("reference_rate")
+    return f"{number(rate)}{unit}" + (f", × {ratio(rate / reference)} (competent driver)" if reference else "")
 
 
 def _cut_off_counts(rate: float, cut_off: float, high: float) -> bool:

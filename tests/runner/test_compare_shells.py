@@ -161,7 +161,7 @@ def test_a_margin_is_decided(campaigns, done, tmp_path, swapped, verdict, exit_c
     assert (found.content["decision"]["verdict"], found.exit_code) == (verdict, exit_code)
     low, high = found.content["decision"]["ratio"]
     end = f"≤ {ratio(1.0 / low)}" if swapped else f"≥ {ratio(1.0 / high)}"  # in the direction of the row A / B
-    assert pair_words(found.content["decision"]).endswith(f"10 % worse than A (A / B {end})")
+    assert pair_words(found.content["decision"]).endswith(f"10 % worse than A (A / B {end}, limit 0.91)")
     assert pair_words(found.content["decision"]).startswith("B crashes less often than A, so") == (high < 1.0)
     assert "verdict: confidence 0.95 over all looks" in " ".join(repr(found).split())
     assert low > 1.1 if swapped else high <= 1.1
