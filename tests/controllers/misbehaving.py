@@ -344,3 +344,15 @@ class StepOfNothing:
 
     def step(self):
         return 0.0
+
+
+class Moody(IDM):
+    """Fails in some tests, sleeps in others, and never does the same twice."""
+
+    def start(self, episode):
+        self.mood = episode.episode % 4
+
+    def step(self, seen):
+        if self.mood == 1 and seen.gap_m < 30.0:
+            raise RuntimeError("no")
+        return 3.0 if self.mood == 2 else super().step(seen) - random.random()

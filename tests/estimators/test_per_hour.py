@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.stats import chi2
 
 from harness.campaign.files import load_campaign
 from harness.estimators.likelihood import Level, likelihood_limit
@@ -14,6 +15,7 @@ from harness.estimators.per_hour import FamilyTests, PerHour
 from harness.estimators.shells import SeenShells
 from harness.estimators.stopping import Decision, RoundRule
 from harness.estimators.tally import Tally
+from harness.families.cut_in.family import CUT_IN
 from harness.families.protocol import Exposure
 from harness.numbers import two_digits_up
 from harness.sampling.shells import HourRounds
@@ -328,3 +330,11 @@ def test_intervals_with_counted_exposures_cover():
 def test_it_is_narrower_than_any_sum_of_limits():
     found, own = PerHour(THREE).limits(LEVEL), [of.limits(LEVEL) for of in THREE]
     assert sum(each.low for each in own) < found.low < found.rate < found.high < sum(each.high for each in own)
+
+
+def test_a_counted_exposure_is_what_it_is_counted_from():
+    """Exact Poisson limits at 90 %: half a quantile of χ² with 2 k and 2 k + 2 degrees of freedom."""
+    told = CUT_IN.exposure(None, None)
+    k, hours = told.counted
+    low, high = 0.5 * chi2.ppf(0.05, 2 * k) / hours, 0.5 * chi2.ppf(0.95, 2 * k + 2) / hours
+    assert (told.per_hour, told.low, told.high) == pytest.approx((k / hours, low, high), abs=5e-4)

@@ -11,16 +11,13 @@ import pytest
 
 import harness
 from harness.cli import main
-from harness.estimators.answer import n_softened
 from harness.families import family_named
 from harness.families.following.approach import starts_from
 from harness.families.following.family import MILDEST_MPS2, N_SPEEDS
 from harness.families.protocol import Paths
-from harness.numbers import number
 from harness.records.folder import read_manifest
-from harness.report.rows import ratio_texts
 from harness.runner.stored import estimate_run
-from harness.sampling.paths import beyond_scope, n_left_out
+from harness.sampling.paths import beyond_scope
 from tests.families.roads import SETTINGS, traffic_of
 from tests.families.test_same_bits import SMALL
 from tests.in_process import controllers_here, one_process, run_here, without_page
@@ -28,7 +25,6 @@ from tests.in_process import controllers_here, one_process, run_here, without_pa
 CUT_OUT = family_named("cut_out")
 AV = """
 import math
-import random
 
 
 class MyAV:
@@ -46,16 +42,6 @@ class Fails(MyAV):
     def start(self, episode):
         if episode.episode == 3:
             raise RuntimeError("no")
-
-
-class Moody(MyAV):
-    def start(self, episode):
-        self.dizzy, self.sleeps = episode.episode % 4 == 1, episode.episode % 4 == 2
-
-    def step(self, seen):
-        if self.dizzy and seen.gap_m < 30.0:
-            raise RuntimeError("no")
-        return 3.0 if self.sleeps else super().step(seen) - random.random()
 
 
 class Rams(MyAV):
@@ -161,52 +147,6 @@ def test_one_that_makes_the_events_milder_itself_is_told_so_and_not_accepted(tmp
     told = " ".join(capsys.readouterr().out.split())
     assert "yet not accepted, see !" in told
     assert "it never braked with 1 m/s² or more (below 0): does it see the other vehicle?" in told
-
-
-@pytest.mark.parametrize(
-    ("behind", "braked", "waits", "built_in", "n"),
-    [
-        (11, 0, False, False, 11),
-        (10, 0, False, False, 0),
-        (0, 50, True, False, 50),
-        (0, 50, False, False, 0),
-        (90, 90, True, True, 0),
-    ],
-)
-def test_many_events_that_it_made_milder_are_more_than_a_tenth(behind, braked, waits, built_in, n):
-    acts = {"n_fell_behind": behind, "n_braked_before": braked, "waits": waits, "built_in": built_in, "n_events": 100}
-    assert n_softened(acts) == n
-    reference = {"ratio": 0.5, "ratio_low": 0.4, "ratio_high": 0.6}
-    less, _ = ratio_texts(reference, wide=False, from_below=False, softened=n > 0)
-    assert less == ("0.50 (crashes less, see !)" if n else "0.50 (crashes less)")
-
-
-def test_crashes_before_events_are_left_out_where_the_vehicle_follows():
-    """But not by plain simulation, which counts such crashes as they are."""
-    asked = [["scenario=lead_brakes"], ["scenario=lead_brakes", "testing.method=nde"], ["scenario=cut_out"], []]
-    assert [n_left_out(harness.load_campaign("idm", each), 3) for each in asked] == [3, 0, 3, 0]
-
-
-@pytest.mark.slow
-def test_the_sum_warns_of_what_a_scenario_alone_would(tmp_path):
-    """Tests that failed, that differed when run twice, that crashed before the event: each says of which scenario."""
-    (tmp_path / "my_av.py").write_text(AV)
-    quick = (*SMALL, "world.engine=twin", "stop.rhw=null", "stop.below_reference=null", "stop.episodes=400")
-    both = ("scenarios=[cut_in, lead_brakes]", "run.max_failed_share=0.5")
-    run = run_here(harness.load_campaign(f"{tmp_path}/my_av.py:Moody", [*quick, *both]), tmp_path / "run")
-    told = " ".join(repr(run).split())
-    for name, words in (("cut_in", "cut-in"), ("lead_brakes", "lead brakes")):
-        of, alone = run.content["families"][name], run.runs[name].estimates
-        best, scale = alone["estimates"]["shells"], of["exposure"]["per_hour"] / of["p_event"]
-        assert of["n_failed"] == best["details"]["n_failed"] > 0
-        worst = scale * best["details"]["crash_rate_if_failed_had_crashed"]
-        assert of["if_failed_had_crashed"] == pytest.approx(worst, rel=1e-12)
-        failed = f"{of['n_failed']} of {of['n_episodes']} tests FAILED; had they all crashed, as upper limits assume"
-        assert f"! {words}: {failed}, the rate would be {number(worst)} per hour" in told
-        assert f"! {words}: NOT REPRODUCIBLE: " in told
-    assert "! lead brakes: " in told.partition("tests crashed BEFORE the event")[0]
-    again = harness.estimate_families(run.folder)
-    assert {**again, "crc32": 0} == {**run.content, "crc32": 0}
 
 
 @pytest.mark.slow

@@ -538,3 +538,24 @@ def test_a_stored_campaign_that_is_damaged_is_not_believed(run, tmp_path):
     with pytest.raises(RunFolderError, match="checksum"):
         compare_campaigns(campaign(), campaign(HARDER), tmp_path / "out", stored=stored)
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.slow
+def test_the_sum_warns_of_what_a_scenario_alone_would(tmp_path):
+    """Tests that failed, that differed when run twice, that crashed before the event: each says of which scenario."""
+    asked = ("stop.rhw=null", "stop.episodes=400", "scenarios=[cut_in, lead_brakes]", "run.max_failed_share=0.5")
+    moody = "av={controller: 'tests.controllers.misbehaving:Moody'}"
+    run = run_here(campaign(*asked, moody), tmp_path / "run")
+    told = " ".join(repr(run).split())
+    for name, words in (("cut_in", "cut-in"), ("lead_brakes", "lead brakes")):
+        of, alone = run.content["families"][name], run.runs[name].estimates
+        best, scale = alone["estimates"]["shells"], of["exposure"]["per_hour"] / of["p_event"]
+        assert of["n_failed"] == best["details"]["n_failed"] > 0
+        worst = scale * best["details"]["crash_rate_if_failed_had_crashed"]
+        assert of["if_failed_had_crashed"] == pytest.approx(worst, rel=1e-12)
+        failed = f"{of['n_failed']} of {of['n_episodes']} tests FAILED; had they all crashed, as upper limits assume"
+        assert f"! {words}: {failed}, the rate would be {number(worst)} per hour" in told
+        assert f"! {words}: NOT REPRODUCIBLE: " in told
+    assert "! lead brakes: " in told.partition("tests crashed BEFORE the event")[0]
+    again = estimate_families(run.folder)
+    assert {**again, "crc32": 0} == {**run.content, "crc32": 0}
