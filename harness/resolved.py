@@ -9,7 +9,8 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 from harness.campaign.campaign import Campaign, Command, Use, refusal
-from harness.controllers.find import TriedScript, require_controller, source_of_own, tried_script
+from harness.controllers.find import require_controller, source_of_own, tried_script
+from harness.controllers.traci_style import TriedScript
 from harness.errors import CampaignError
 from harness.estimators.one_pass import accumulator, headline_of
 from harness.families import family_named

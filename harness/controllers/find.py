@@ -18,7 +18,7 @@ from operator import methodcaller
 from pathlib import Path
 from threading import RLock
 from types import ModuleType, SimpleNamespace
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, TypeVar
 
 from harness.campaign.python_files import (
     FromSource,
@@ -31,12 +31,11 @@ from harness.campaign.python_files import (
 )
 from harness.campaign.vehicle import AutomatedVehicle
 from harness.controllers.hosts import BatchHost, BeforeTest, ControllerHost, Guard, VehicleHost, cause_of, death_cause
-from harness.controllers.traci_style import WAITS, StepListenerController
+from harness.controllers.traci_style import WAITS, StepListenerController, TriedScript
 from harness.errors import EXIT_TOO_MANY_FAILED, CampaignError, HarnessError
 from harness.files import real_path
 from harness.problems import did_you_mean, nearest
 from harness.processes import Child, WorkerDeath, first_to_answer, tell
-from harness.vehicles.kinematics import STEP_S
 
 _Answer = TypeVar("_Answer")
 _RUNNING = RLock()  # a file: surrogates' tables are made side by side, and none may see half of it
@@ -306,27 +305,13 @@ MOST_IDLE_S = 10.0
 """Time after which a script is refused that has not looked at a vehicle: most events are over [assumed]."""
 
 
-class TriedScript(NamedTuple):
-    """What a TraCI script does when it is tried: for 15 s, in which a car cuts in, and then drives ahead.
-
-    ``step_s`` is the step that it asks for. It is ``idle_s``, looking at no vehicle, before it begins; and ``left_s``
-    is how long, with somebody ahead, it gives no command, so that SUMO's own model would drive. ``safe_speeds``: its
-    speed mode is SUMO's own, in which safe speeds would bound its commands.
-    """
-
-    step_s: float
-    idle_s: float
-    left_s: float
-    safe_speeds: bool
-
-
 def tried_script(av: AutomatedVehicle) -> TriedScript | None:
     """What a TraCI script does; None of any other controller. What its type bounds is said once, on stderr."""
     if not is_script(name := str(av.controller)):
         return None
     from harness.controllers.traci_ego import asked_for  # noqa: PLC0415 - few campaigns have one
 
-    (every, hardest, idle, left, safe), bound = run_apart(av, asked_for, av), av.traci_style.decel_mps2
+    (tried, hardest, every), bound = run_apart(av, asked_for, av), av.traci_style.decel_mps2
     file = real_path(file_and_function(name)[0]).name
     if not every:
         note = "names no --step-length, nor does its .sumocfg: it is asked every 0.1 s, where SUMO would ask every 1 s"
@@ -337,11 +322,10 @@ def tried_script(av: AutomatedVehicle) -> TriedScript | None:
     elif hardest > bound and "decel_mps2" not in av.traci_style.model_fields_set:
         note = f"asks for harder braking than {bound:g} m/s², the decel of SUMO's default type, and gets that"
         _tell_once(f"{file} {note}; of another type: --set av.traci_style.decel_mps2=8, say")
-    step_s = STEP_S * (every or 1)
-    if (idle_s := idle * step_s) > MOST_IDLE_S:
-        found, expected = f"{name}, which looks at no vehicle for {idle_s:.0f} s", "a script that drives from its start"
-        raise CampaignError("av.controller", found, expected, WAITS)
-    return TriedScript(step_s, idle_s, left * step_s, safe)
+    if tried.idle_s > MOST_IDLE_S:
+        found = f"{name}, which looks at no vehicle for {tried.idle_s:.0f} s"
+        raise CampaignError("av.controller", found, "a script that drives from its start", WAITS)
+    return tried
 
 
 def _sources_of_made(av: AutomatedVehicle) -> str | None:

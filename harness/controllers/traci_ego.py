@@ -17,11 +17,11 @@ import numpy as np
 import sumo_data
 
 from harness.campaign.python_files import TRACI_MODULES, file_and_function
-from harness.campaign.vehicle import AutomatedVehicle
+from harness.campaign.vehicle import AutomatedVehicle, TraciStyle
 from harness.controllers.hosts import Guard, cause_of
 from harness.controllers.protocol import EpisodeStart, Neighbour, Observation
 from harness.controllers.traci_script import ScriptController, ScriptTraci, TraciScript
-from harness.controllers.traci_style import WAITS
+from harness.controllers.traci_style import WAITS, TriedScript
 from harness.controllers.traci_vehicle import DECEL, SAFE_SPEED, VEH_ID, SeenVehicle, VehicleDomain
 from harness.errors import CampaignError
 from harness.vehicles.kinematics import STEP_S, VEHICLE_LENGTH_M
@@ -143,10 +143,12 @@ class _Tried(VehicleDomain):
 
     getAccel, getDecel = staticmethod(lambda _: 2.6), staticmethod(lambda _: 4.5)  # of SUMO's default type
 
-    @property
-    def safe(self) -> bool:
-        """Whether SUMO's safe speeds would bound what it commands."""
-        return bool(self._speed_mode & SAFE_SPEED)
+    def told(self, every: int, of: TraciStyle) -> TriedScript:
+        """What is known of it in the end, where it acts in one of ``every`` steps, and its vehicle is ``of`` a type."""
+        step_s, safe = STEP_S * (every or 1), bool(self._speed_mode & SAFE_SPEED)
+        accel = self._accel if math.isfinite(self._accel) else of.accel_mps2
+        decel = self._decel if math.isfinite(self._decel) else of.decel_mps2
+        return TriedScript(step_s, self.idle * step_s, self.left * step_s, safe, accel, decel)
 
     def next_acceleration(self) -> float:
         told = [*islice(self._plan, 1)]
@@ -209,8 +211,8 @@ def _commanded(script: TraciScript, ego: str) -> tuple[_Tried, str]:
     return tried, ""
 
 
-def asked_for(av: AutomatedVehicle) -> tuple[int, float, int, int, bool]:
-    """Steps of the harness in one of a script, 0 if it says none; ``hardest``, ``idle``, ``left``, ``safe`` of `_Tried`."""
+def asked_for(av: AutomatedVehicle) -> tuple[TriedScript, float, int]:
+    """What a script does, ``hardest`` of `_Tried`, and the harness's steps in one that it asks for, 0 if none."""
     script, ego = TraciScript(str(av.controller), dict(av.parameters)), av.traci_style.ego
     tried = _Tried(ego or _AnyName(VEH_ID))
     controller = ScriptController(script, lambda *_: tried)
@@ -222,7 +224,7 @@ def asked_for(av: AutomatedVehicle) -> tuple[int, float, int, int, bool]:
         else:
             answer, _ = guard.call(_commanded, script, ego, makes=True)
             tried = answer[0] if answer else tried
-    return controller.traci.every, tried.hardest, tried.idle, tried.left, tried.safe
+    return tried.told(every := controller.traci.every, av.traci_style), tried.hardest, every
 
 
 def _drive(controller: ScriptController, n_steps: int = 150) -> None:

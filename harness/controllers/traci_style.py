@@ -11,7 +11,7 @@ import math
 from collections.abc import Callable
 from copy import deepcopy
 from types import ModuleType
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -26,6 +26,23 @@ WAITS = (
     "--set av.parameters.NAME=…"
 )
 """What to do about a script that waits."""
+
+
+class TriedScript(NamedTuple):
+    """What a TraCI script does when it is tried: for 15 s, in which a car cuts in, and then drives ahead.
+
+    ``step_s`` is the step that it asks for. It is ``idle_s``, looking at no vehicle, before it begins; and ``left_s``
+    is how long, with somebody ahead, it gives no command, so that SUMO's own model would drive. ``safe_speeds``: its
+    speed mode is SUMO's own, in which safe speeds would bound its commands. The last two are what its vehicle's type
+    is left with.
+    """
+
+    step_s: float
+    idle_s: float
+    left_s: float
+    safe_speeds: bool
+    accel_mps2: float
+    decel_mps2: float
 
 
 class SimulationDomain(Domain):

@@ -109,8 +109,8 @@ def vehicle_words(av: AutomatedVehicle, script: Mapping[str, float] | None = Non
     if av.sumo is not None:
         chosen |= av.sumo
         name = f"SUMO’s {chosen.pop('carFollowModel', 'Krauss')}"
-    elif script:  # SUMO would know its vehicle's type, whose numbers hold until the script sets others
-        accel, decel = plain(av.traci_style.accel_mps2), plain(av.traci_style.decel_mps2)
+    elif script:  # SUMO would know its vehicle's type, of which the script may set other numbers
+        accel, decel = plain(script["accel_mps2"]), plain(script["decel_mps2"])
         chosen["type"] = f"accel {accel}, decel {decel}, minGap 0"
         chosen |= {} if script["step_s"] == STEP_S else {"step": f"{plain(script['step_s'])} s"}
     elif av.traci is not None:

@@ -73,7 +73,7 @@ def check_av(campaign: Campaign | str | Path, n_episodes: AtLeastTwo = EPISODES)
     limits = bounds.min_acceleration_mps2, bounds.max_acceleration_mps2
     if script := tried_script(tested.av):  # clipped by its type's, see docs/controllers.md
         a = np.concatenate([[], *(trace[:-1, -1, 2] for trace in first.traces.values())])  # it may change its own type
-        low, high = -tested.av.traci_style.decel_mps2, tested.av.traci_style.accel_mps2
+        low, high = -script.decel_mps2, script.accel_mps2
         limits = float(np.fmin.reduce(a, initial=low)), float(np.fmax.reduce(a, initial=high))
     differing = tuple(i for i in range(n_episodes) if bits_of(first, i) != again[i])
     cause, clock_read_at = _likely_cause(source, differing[0]) if differing else (None, ())

@@ -332,9 +332,10 @@ def test_a_script_that_leaves_the_vehicle_to_sumo_is_told_that_here_it_keeps_its
 def test_a_script_that_sumos_safe_speeds_would_hold_back_is_told_that_here_they_do_not(modes, bounded, tmp_path):
     """A script that alone would never crash in SUMO may crash here."""
     sets = "\n    ".join(f"traci.vehicle.setSpeedMode('ego', {mode})" for mode in modes.split())
-    (tmp_path / "my.py").write_text(text(f"{sets or 'pass'}\n    traci.vehicle.setSpeed('ego', 20.0)"), "utf-8")
+    drives = "traci.vehicle.setDecel('ego', 6.0)\n    traci.vehicle.setSpeed('ego', 20.0)"
+    (tmp_path / "my.py").write_text(text(f"{sets or 'pass'}\n    {drives}"), "utf-8")
     tried = tried_script(load_campaign(str(tmp_path / "my.py")).av)
-    assert tried.safe_speeds == bounded
+    assert (tried.safe_speeds, tried.accel_mps2, tried.decel_mps2) == (bounded, 2.6, 6.0)
     assert ["safe speeds would hold" in words for words in script_words(tried._asdict())] == [True] * bounded
 
 
