@@ -72,7 +72,7 @@ def rows_of(campaign: Campaign, manifest: Mapping[str, Any], estimates: Estimate
     if campaign.has_baseline_runs and best.n_crashes:
         yield from width_row(campaign, best, manifest.get("expected"))
     if estimates.severity is not None:
-        yield from _severity(estimates.severity, so_far)
+        yield _severity(estimates.severity, so_far, above_mps)
     if "within" in best.details and campaign.testing.shells.statement != ASSUMPTION_FREE:
         yield within(best.details["within"])
 
@@ -120,10 +120,11 @@ def width_row(campaign: Campaign, best: Estimate, expected: Mapping[str, int] | 
     yield Row("width", "precision", f"± {share(rhw)}, mostly by {which}", alone, remark)
 
 
-def _severity(severity: Severity, so_far: str) -> Iterator[Row]:
+def _severity(severity: Severity, so_far: str, counts_above_mps: float) -> Row:
     above = _share_within(severity.share_above_5_mps, severity.limits_above_5_mps, f" above {plain(HARD_MPS)} m/s")
     below = _share_within(severity.share_below_1_mps, severity.limits_below_1_mps, f" below {plain(TOUCH_MPS)} m/s")
-    yield Row("impact", f"impact speed{so_far}", f"median {tenths(severity.median_mps)} m/s", above, below)
+    below = below if counts_above_mps < TOUCH_MPS else ""  # such are no crashes then
+    return Row("impact", f"impact speed{so_far}", f"median {tenths(severity.median_mps)} m/s", above, below)
 
 
 def _share_within(value: float, limits: tuple[float, float] | None, suffix: str) -> str:

@@ -285,7 +285,17 @@ def deciding_words(content: Mapping[str, Any], s_per_pair: float | None = None) 
     settings = "".join(f" --set {key}={value}" for key, value in needed["settings"].items())
     options = f"--margin {decision['margin'] or 0.0:g}{settings}"
     where += ", and without --set stop.rhw, if you gave it" * (content.get("ended") == "rhw")
-    return f"to decide, repeat the command with {options}{where}: about {count(n)} {pairs}{cost}"
+    return f"{_left_open(content)}to decide, repeat the command with {options}{where}: about {count(n)} {pairs}{cost}"
+
+
+def _left_open(content: Mapping[str, Any]) -> str:
+    """That pairs of tests differ, but less than crashes where nobody looked may weigh, if that is so."""
+    within = [content[side].get("details", {}).get("within") or {} for side in "ab"]
+    most = max(of.get("upper_bound_outside") or 0.0 for of in within)
+    if most <= abs(content["difference"]) or any(of.get("n_crashes_outside") for of in within):
+        return ""
+    n = count(content["conditional"]["n_pairs_outside"])
+    return f"outside of the library's shells {n} pairs had no crash, which leaves up to {number(most)} open; "
 
 
 def pair_asked(content: Mapping[str, Any]) -> Mapping[str, Any]:
@@ -328,7 +338,7 @@ def pair_lines(
         rows.append((f"{name} {label}", rate, ends, f"{count(n)} crash{'es' * (n != 1)}"))
     decision = content["decision"]
     apart = not (asked["ratio_low"] or 0.0) < 1.0 < (asked["ratio_high"] or math.inf)
-    one_look = "; interval: of one look" * (apart and decision["verdict"] == "open")
+    one_look = "; interval: of one look" * (decision["margin"] is not None or apart and decision["verdict"] == "open")
     looks = f"verdict: confidence {plain(decision['confidence'])} over all looks{one_look}"
     rows.append(("A / B", *ratio_words(asked), looks))
     ends = interval(asked["ci_low"], asked["ci_high"], beside=asked["difference"])

@@ -198,7 +198,8 @@ def replay_episode(
                 require_trust(folder, manifest, code, _TRUST)
         return _simulated(folder, manifest, campaign, tables, episode)
     if "traces" not in tables or not tables["traces"].num_rows:
-        mend = "Simulate it again (without --stored), or run with --set records.traces=all, say."
+        again = "Simulate it again (without --stored), or run" if manifest.get("reproducible", True) else "Run"
+        mend = f"{again} with --set records.traces=all, say."
         raise RunFolderError(str(folder), f"no stored motion of test {episode}", "a test that is traced", mend)
     return _result(campaign, traffic_of(campaign, manifest), tables)
 

@@ -55,6 +55,11 @@ def test_the_numbers_are_those_of_the_comparison(compared, page):
         "--margin 0 and a new --out, and without --set stop.rhw, if you gave it: about 90,000 pairs"
         in deciding_words(left_open)
     )
+    assert not any(found[side]["details"]["within"]["n_crashes_outside"] for side in "ab")
+    most = max(found[side]["details"]["within"]["upper_bound_outside"] for side in "ab")
+    for apart, told in ((0.9 * most, True), (1.1 * most, False)):  # less than, or more than, what nobody saw may weigh
+        words = f"had no crash, which leaves up to {number(most)} open"
+        assert (words in deciding_words({**left_open, "difference": -apart})) == told
     assert len(page.ids) == len(set(page.ids))
 
 
