@@ -338,7 +338,8 @@ def pair_lines(
         rows.append((f"{name} {label}", rate, ends, f"{count(n)} crash{'es' * (n != 1)}"))
     decision = content["decision"]
     apart = not (asked["ratio_low"] or 0.0) < 1.0 < (asked["ratio_high"] or math.inf)
-    one_look = "; interval: of one look" * (decision["margin"] is not None or apart and decision["verdict"] == "open")
+    may_differ = decision["margin"] is not None or (apart and decision["verdict"] == "open")
+    one_look = "; interval: of one look" * may_differ
     looks = f"verdict: confidence {plain(decision['confidence'])} over all looks{one_look}"
     rows.append(("A / B", *ratio_words(asked), looks))
     ends = interval(asked["ci_low"], asked["ci_high"], beside=asked["difference"])
