@@ -17,10 +17,16 @@ BRAKES_BEFORE = "in {} it braked with nobody ahead, which makes the event milder
 SPEEDS_UP_BEFORE = "in {} it asked to speed up before BV was in its lane, and its speed was held"
 
 
-def late_words(scenario: str, *, script: bool) -> str:
-    """That a vehicle does nothing before an event is complete, as BV in its lane, and what would show it."""
+def late_words(scenario: str, n_early: int, n_events: int, *, script: bool) -> str:
+    """That a vehicle does nothing before events are complete, as BV in its lane, and what would show it.
+
+    Empty where it does something in many: one that follows may brake for another reason.
+    """
+    if not n_events or n_early > MANY * n_events:
+        return ""
     what, seen, seen_by_script = family_named(scenario).words.late
-    return f"it did nothing before {what}; {seen_by_script if script else seen} shows it earlier"
+    but = f"in all but {tests(n_early)} " * (n_early > 0)
+    return f"{but}it did nothing before {what}; {seen_by_script if script else seen} shows it earlier"
 
 
 def cruise_words(did: Sequence[str], *, script: bool) -> str:
@@ -56,8 +62,9 @@ def acted_words(scenario: str, before: Mapping[str, Any] | None) -> Iterator[str
         if before["source"] in ("sumo", "traci"):
             sees = " ".join(shown.shows)
             yield f"SUMO changes lanes in one step: this vehicle cannot see that {sees}, as drivers can"
-        elif before["n_events"] and not before["n_braked_early" if follows else "n_took_over_early"]:
-            yield late_words(scenario, script=script is not None)
+        else:
+            n_early = before["n_braked_early" if follows else "n_took_over_early"]
+            yield from filter(None, [late_words(scenario, n_early, before["n_events"], script=script is not None)])
     if not before["waits"]:
         return
     did = [BRAKES_BEFORE.format(tests(n))] if (n := before["n_braked_before"]) else []

@@ -171,8 +171,10 @@ def verdict(check: AvCheck) -> str:
             f"{speed.constructions} times: what all may share, load once (`load`, see docs/controllers.md)."
         )
     hides = family_named(check.scenario).words.late[0] and (check.shows or check.follows is not None)
-    if hides and check.source == "controller" and not behaviour.n_took_over_early:
-        advice += f" But {late_words(check.scenario, script=check.script is not None)}."
+    seen = check.scenario, behaviour.n_took_over_early, behaviour.n_events
+    late = late_words(*seen, script=bool(check.script)) if hides and check.source == "controller" else ""
+    if late:
+        advice += f" But {late}."
     if check.shows and check.source != "model" and behaviour.n_asked_to_speed_up:
         asked = SPEEDS_UP_BEFORE.format(tests(behaviour.n_asked_to_speed_up))
         advice += f" But {cruise_words([asked], script=check.script is not None)}."

@@ -428,11 +428,12 @@ def test_a_reading_of_the_regulation_that_turns_the_answer_is_said(run):
 def test_what_the_vehicle_did_before_bv_came_is_said_as_in_the_answer_of_one_scenario(run):
     of = run.content["families"]
     assert of["cut_in"]["before_event"]["built_in"]
-    acted = {**of["cut_in"]["before_event"], "n_braked_before": 1234, "n_took_over_early": 0}
-    content = {**run.content, "families": {**of, "cut_in": {**of["cut_in"], "before_event": acted}}}
-    told = " ".join(" ".join(hour_lines(content)).split())
-    assert "! cut-in: in 1,234 tests it braked with nobody ahead" in told
-    assert "! cut-in: it did nothing before the other car" in told
+    for early, but in ((0, ""), (5, "in all but 5 tests "), (6, None)):
+        acted = {**of["cut_in"]["before_event"], "n_braked_before": 1234, "n_took_over_early": early, "n_events": 50}
+        content = {**run.content, "families": {**of, "cut_in": {**of["cut_in"], "before_event": acted}}}
+        told = " ".join(" ".join(hour_lines(content)).split())
+        assert "! cut-in: in 1,234 tests it braked with nobody ahead" in told
+        assert (f"! cut-in: {but}it did nothing before the other car" in told) == (but is not None)
     brakes = {**of["lead_brakes"]["before_event"], "built_in": False, "n_events": 50}
     for n, warned in ((6, True), (5, False)):
         part = {**of["lead_brakes"], "before_event": {**brakes, "n_fell_behind": n}, "share_below_1_mps": 0.1 * n}
