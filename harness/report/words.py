@@ -281,8 +281,8 @@ def go_on(n: int, n_crashes: int = 0, decision: Mapping[str, Any] | None = None,
         return f"; the same command with --resume --set stop.episodes={more} goes on"
     times = end(decision["high"]) / decision["limit"]  # without a crash an upper limit falls with 1/n, or faster
     decidable = not n_crashes and 1.0 < times < math.inf
-    enough = f": without a crash at most some {count(two_digits_up(n * times))} tests decide" if decidable else ""
-    return f"; the same command with --resume --set stop.episodes={2 * n} goes on{enough}"
+    how = "decides, if none of them crashes" if decidable else "goes on"
+    return f"; the same command with --resume --set stop.episodes={two_digits_up(n * times) if decidable else 2 * n} {how}"
 
 
 def reached_words(rhw: float, width: str) -> str:
