@@ -277,12 +277,12 @@ def go_on(n: int, n_crashes: int = 0, decision: Mapping[str, Any] | None = None,
     ``further`` is how many times as many may do, infinite where that is not known.
     """
     if decision is None:
-        more = two_digits_up(n * min(max(further, 2.0), MOST_FURTHER))
-        return f"; the same command with --resume --set stop.episodes={more} goes on"
+        enough = two_digits_up(n * min(max(further, 2.0), MOST_FURTHER))
+        return f"; the same command with --resume --set stop.episodes={enough} goes on"
     times = end(decision["high"]) / decision["limit"]  # without a crash an upper limit falls with 1/n, or faster
     decidable = not n_crashes and 1.0 < times < math.inf
-    how = "decides, if none of them crashes" if decidable else "goes on"
-    return f"; the same command with --resume --set stop.episodes={two_digits_up(n * times) if decidable else 2 * n} {how}"
+    more, how = (times, "decides, if none of them crashes") if decidable else (2.0, "goes on")
+    return f"; the same command with --resume --set stop.episodes={two_digits_up(n * more)} {how}"
 
 
 def reached_words(rhw: float, width: str) -> str:
