@@ -55,7 +55,7 @@ class Resolved:
         """What its tests have in common."""
         family, environment = self.family, self.environment
         return Scenario(
-            seed=self.campaign.seed, vehicles=family.vehicles, principal=family.principal, ahead=family.ahead,
+            seed=self.campaign.vehicle_seed, vehicles=family.vehicles, principal=family.principal, ahead=family.ahead,
             max_steps=family.max_steps(environment), sideways_m=family.sideways_m(environment),
             shows=family.shows(environment), driver=self.av, columns=family.columns,
         )  # fmt: skip

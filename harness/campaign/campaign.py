@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import zlib
 from collections.abc import Callable
 from itertools import starmap
 from typing import Annotated, Any, Literal, NamedTuple, Self
@@ -113,6 +114,11 @@ class Campaign(Section):
         return self.model_copy(
             update={"scenario": name, "scenarios": None, "exposure": {}, "environments": {}, "stop": stop, **changes}
         )
+
+    @property
+    def vehicle_seed(self) -> int:
+        """Seed of the vehicle's own random numbers: one for each scenario, or it would fail in the same tests of all."""
+        return self.seed if self.scenario == DEFAULT_FAMILY else self.seed ^ zlib.crc32(self.scenario.encode())
 
     @property
     def sampling(self) -> Sampling:

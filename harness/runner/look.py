@@ -173,7 +173,7 @@ def _moved_by_warm_up(source: Source, n: int) -> dict[float, float]:
 
 
 def _first_answers(source: Source, av: AutomatedVehicle, n: int) -> dict[int, float]:
-    host = build_host(av, n_cells=1, seed=source.campaign.seed, names=source.scenario.shown)
+    host = build_host(av, n_cells=1, seed=source.scenario.seed, names=source.scenario.shown)
     answers: Any = FirstAnswers(host) if host is not None else None
     world = TwinWorld(1, source.scenario.vehicles)
     with closing(EpisodeLoop(world, source.scenario, source.records(), answers)) as loop:

@@ -120,9 +120,8 @@ class Source:
 
     def loop(self, world: World, *, traces: str | None = None, before_test: BeforeTest = lambda _: None) -> EpisodeLoop:
         """Episode loop in a world, recording what the campaign asks for, or other ``traces``."""
-        campaign = self.campaign
-        seed, names = campaign.seed, self.scenario.shown
-        av = build_host(campaign.av, n_cells=world.n_cells, seed=seed, before_test=before_test, names=names)
+        seed, names = self.scenario.seed, self.scenario.shown
+        av = build_host(self.campaign.av, n_cells=world.n_cells, seed=seed, before_test=before_test, names=names)
         return EpisodeLoop(world, self.scenario, self.records(traces), av)
 
     def records(self, traces: str | None = None) -> RecordPolicy:
