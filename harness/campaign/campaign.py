@@ -106,14 +106,11 @@ class Campaign(Section):
 
     def of_family(self, name: str) -> Campaign:
         """The campaign of one of its scenarios; ``environment`` itself is that of cut-ins."""
-        changes: dict[str, Any] = {}
+        changes: dict[str, Any] = {"scenario": name, "scenarios": None, "exposure": {}, "environments": {}}
         if name != DEFAULT_FAMILY:  # in the others the vehicle drives from the start in any case
-            own = EnvironmentSettings(parameters=self.environments.get(name, DEFAULT))
-            changes = {"environment": own, "av": self.av.model_copy(update=WAITS)}
-        stop = self.stop.model_copy(update={"each_family": False})
-        return self.model_copy(
-            update={"scenario": name, "scenarios": None, "exposure": {}, "environments": {}, "stop": stop, **changes}
-        )
+            changes["environment"] = EnvironmentSettings(parameters=self.environments.get(name, DEFAULT))
+            changes["av"] = self.av.model_copy(update=WAITS)
+        return self.model_copy(update={"stop": self.stop.model_copy(update={"each_family": False}), **changes})
 
     @property
     def vehicle_seed(self) -> int:

@@ -110,9 +110,8 @@ class Source:
 
     def paths(self, first_episode: int, n_episodes: int) -> Paths:
         """Paths of consecutive episodes, (n_episodes,)."""
-        family, seed = self.resolved.family, self.campaign.seed
-        u = uniforms(seed, first_episode, n_episodes, INITIAL, family.n_uniforms)
-        return Paths(first_episode + np.arange(n_episodes), family.start(self.resolved.environment, u))
+        u = uniforms(self.campaign.seed, first_episode, n_episodes, INITIAL, self.resolved.family.n_uniforms)
+        return Paths(first_episode + np.arange(n_episodes), self.resolved.family.start(self.resolved.environment, u))
 
     def tests(self, first_episode: int, n_episodes: int) -> Traffic:
         """What the others do in consecutive episodes."""
@@ -126,8 +125,7 @@ class Source:
 
     def records(self, traces: str | None = None) -> RecordPolicy:
         """What the campaign asks to be recorded of its tests, or with other ``traces``."""
-        settings = self.campaign.records
-        return RecordPolicy(traces or settings.traces, settings.trace_share)
+        return RecordPolicy(traces or self.campaign.records.traces, self.campaign.records.trace_share)
 
     def run(self, loop: EpisodeLoop, request: ShardRequest) -> Shard:
         """Run the tests of a shard."""
