@@ -114,7 +114,7 @@ class Campaign(Section):
 
     @property
     def vehicle_seed(self) -> int:
-        """Seed of the vehicle's own random numbers: one for each scenario, or it would fail in the same tests of all."""
+        """Seed of the vehicle's own random numbers: one for each scenario, or it fails in the same tests of all."""
         return self.seed if self.scenario == DEFAULT_FAMILY else self.seed ^ zlib.crc32(self.scenario.encode())
 
     @property
