@@ -29,6 +29,7 @@ from harness.estimators.traffic import (
     tests_of_sum,
     uncertain,
 )
+from harness.families import family_named
 from harness.families.protocol import Parameters
 from harness.pool.moved import assumed
 from harness.progress import Progress
@@ -120,10 +121,8 @@ def traffic_error(moved: StoredShells, content: Mapping[str, Any], progress: Pro
     interval = estimate["ci_low"], estimate["ci_high"]
     if not estimate["n_crashes"] or not holds:
         interval = 0.0, estimate["upper_bound"]
-    below = unseen is None and holds
-    rate = uncertain(
-        estimate["crash_rate"], interval, factors, off, n_refused, confidence, from_below=below, held=holds
-    )
+    args = factors, off, n_refused, confidence
+    rate = uncertain(estimate["crash_rate"], interval, *args, from_below=unseen is None and holds, held=holds)
     drivers, ratios = [driver.name for driver in moved.design.references], {}
     for beside in estimate["details"]["references"]:
         driver = drivers.index(beside["reference"])
@@ -188,7 +187,7 @@ def sensitivity(
 
 
 def _of_one(folder: Path, ranges: Ranges, progress: Progress, *, per_event: bool = False) -> Sensitivity:
-    """Bars of one run's numbers; ``per_event`` of rates per event, as a scenario's exposure has a bar of its own."""
+    """Bars of one run's numbers; ``per_event`` of rates per event, where events per hour do not move with them."""
     tested = StoredShells.of(folder, progress, _OPTION)
     require_shares(tested)
     settings, parameters = tested.here.campaign.environment, tested.here.parameters
@@ -235,7 +234,9 @@ def _of_sum(folder: Path, ranges: Ranges, progress: Progress) -> Sensitivity:
             not_moved.append(NotMoved(name, 0.0))
         progress.remark = f" ({name.replace('_', ' ')})"
         try:
-            own = _of_one(folder / name, own_ranges[name], progress, per_event=True)
+            # Of a count of all events in an hour, also of those out of scope, the traffic says how many are in scope.
+            per_event = name in stored["exposure"] or not family_named(name).follows
+            own = _of_one(folder / name, own_ranges[name], progress, per_event=per_event)
         except CampaignError as refused:
             not_moved.append(NotMoved(name, shares[0], str(refused.found), str(refused.expected)))
             if (stated := part.get("assumed")) and stated["highest"]:  # the run has told by how much at most
@@ -246,9 +247,8 @@ def _of_sum(folder: Path, ranges: Ranges, progress: Progress) -> Sensitivity:
             for bar in own.bars:
                 what = bar.what if bar.what.startswith(f"{name}.") else f"{name} {bar.what}"
                 bars.append(_part(replace(bar, what=what), *shares))
-    progress.remark = ""
+    progress.remark, driver = "", stored["beside"]["reference"]
     bars.sort(key=lambda bar: -bar.span)
-    driver = stored["beside"]["reference"]
     return Sensitivity(tests_of_sum(stored), "crashes per hour", driver, tuple(bars), tuple(not_moved))
 
 
@@ -300,8 +300,7 @@ def bar_of_readings(design: ShellDesign) -> list[Bar]:
     if not ratios:
         return []
     ratio = min([*ratios, 1.0]), max([*ratios, 1.0])
-    what = f"readings of {next(iter(rates))}"
-    return [Bar(what, "assumed", None, rate=(1.0, 1.0), ratio=ratio, off=(0.0, 0.0), n=len(ratios))]
+    return [Bar(f"readings of {next(iter(rates))}", "assumed", None, (1.0, 1.0), ratio, (0.0, 0.0), len(ratios))]
 
 
 def bar_of(move: Move, results: Sequence[Nearby | None]) -> Bar:

@@ -309,9 +309,11 @@ def test_what_other_traffic_does_to_a_scenario_is_said_once(run):
 def test_what_moves_one_scenario_moves_the_sum_by_its_share(run, tmp_path, monkeypatch, capsys):
     """And an exposure as an answer with that exposure; a scenario that says nothing of its own is named."""
     told, folder = run.content, copy_of(run.folder, tmp_path / "run")
+    stored = read_families(folder)
 
     def of_one(where, ranges, _, *, per_event):
-        assert per_event
+        # The shipped exposure is of all cut-outs: how many are in scope moves with the traffic, unless that is given.
+        assert per_event == (where.name == "cut_in" or where.name in stored["exposure"])
         if where.name == "cut_out":
             raise CampaignError("harness sensitivity", "no number", "one", "Look for one.")
         assert ranges == ({"braking.stop_share": (0.0, 0.1)} if where.name == "lead_brakes" else {})
@@ -325,8 +327,8 @@ def test_what_moves_one_scenario_moves_the_sum_by_its_share(run, tmp_path, monke
     assert left in said
     assert left in (folder / "report.html").read_text()
     assert "no test crashed" not in said
-    stored = read_families(folder)
     stored["families"]["cut_out"] |= {"n_crashes": 0}
+    stored["exposure"] = {"cut_out": 0.01}
     monkeypatch.setattr(other_traffic, "read_families", lambda _: stored)
     none, _ = other_traffic._of_sum(folder, {"braking.stop_share": (0.0, 0.1)}, Progress()).not_moved
     assert not_moved_words(none) == (
