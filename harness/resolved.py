@@ -53,9 +53,9 @@ class Resolved:
     @property
     def scenario(self) -> Scenario:
         """What its tests have in common."""
-        family, environment = self.family, self.environment
+        family, environment, seed = self.family, self.environment, self.campaign.own_seed(self.campaign.seed)
         return Scenario(
-            seed=self.campaign.vehicle_seed, vehicles=family.vehicles, principal=family.principal, ahead=family.ahead,
+            seed=seed, vehicles=family.vehicles, principal=family.principal, ahead=family.ahead,
             max_steps=family.max_steps(environment), sideways_m=family.sideways_m(environment),
             shows=family.shows(environment), driver=self.av, columns=family.columns,
         )  # fmt: skip

@@ -112,10 +112,9 @@ class Campaign(Section):
             changes["av"] = self.av.model_copy(update=WAITS)
         return self.model_copy(update={"stop": self.stop.model_copy(update={"each_family": False}), **changes})
 
-    @property
-    def vehicle_seed(self) -> int:
-        """Seed of the vehicle's own random numbers: one for each scenario, or it fails in the same tests of all."""
-        return self.seed if self.scenario == DEFAULT_FAMILY else self.seed ^ zlib.crc32(self.scenario.encode())
+    def own_seed(self, seed: int) -> int:
+        """A seed of this scenario alone: else a vehicle fails in the same tests of all, and their pools err alike."""
+        return seed if self.scenario == DEFAULT_FAMILY else seed ^ zlib.crc32(self.scenario.encode())
 
     @property
     def sampling(self) -> Sampling:

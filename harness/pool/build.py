@@ -119,11 +119,16 @@ class Aim:
         return np.where(self.conservative, 1.0, AGGRESSIVE_SHARE)
 
 
+def seed_of_paths(resolved: Resolved) -> int:
+    """Of a pool's random numbers: sums take errors of different scenarios as independent."""
+    return resolved.campaign.own_seed(resolved.campaign.pool.seed) ^ POOL_SEED
+
+
 def take_aim(resolved: Resolved, progress: Progress) -> Aim:
     """Aim paths at where surrogates crash, by a pilot run of naturalistic paths."""
     family, environment, library = resolved.family, resolved.environment, resolved.library
     followers = library.followers(family.shows(environment))
-    pilot = Enumerator(family, environment, followers, resolved.campaign.pool.seed ^ POOL_SEED)
+    pilot = Enumerator(family, environment, followers, seed_of_paths(resolved))
     progress.stage("pool: pilot", PILOT_PATHS)
     rates = pilot.run(0, PILOT_PATHS, progress).rates(len(library.surrogates))
     mean, boundary = rates.mean(0), list(library.surrogates).index(library.boundary)
@@ -168,7 +173,7 @@ def pool_of(resolved: Resolved, paths: EnumeratedPaths, key: str, order: IntArra
     n_within = list(names[order]).index(library.boundary) + 1
     times = np.where(np.arange(n_surrogates + 1) < n_within, 1, family.outside_kept)
     path, step = _sample(mass, shell, (settings.events_per_shell * times).tolist(), settings.seed)
-    chosen = family.choose(environment, settings.seed ^ POOL_SEED, Paths(paths.index[path], paths.start[path]), step)
+    chosen = family.choose(environment, seed_of_paths(resolved), Paths(paths.index[path], paths.start[path]), step)
     bits = np.concatenate([order, n_surrogates + np.arange(n_references)])
     crashes = ((paths.crashes[path, step][:, None] >> bits[None, :]) & 1).astype(np.bool_)
     path_mass = by_path[path].astype(np.float32)

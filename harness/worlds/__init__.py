@@ -88,4 +88,4 @@ def build_world(campaign: Campaign, n_cells: int | None = None) -> World:
         return SumoWorld(cells, vehicles)
     if recyclable(av.sumo) and not early:  # one that is released at the start remembers the last episode's event
         return SumoAvWorld(cells, av.sumo, vehicles)
-    return FreshWorld(av.sumo, campaign.vehicle_seed, vehicles, acts_before_event=early)
+    return FreshWorld(av.sumo, campaign.own_seed(campaign.seed), vehicles, acts_before_event=early)

@@ -177,14 +177,6 @@ def test_an_inattentive_driver_is_an_attentive_one_or_a_late_one(name):
     assert (crashed["late"] != crashed["attentive"]).sum() > 20
 
 
-def test_a_vehicle_fails_at_random_in_other_tests_of_each_scenario():
-    """With the same random numbers in all, a sum of three would vary up to √3 times as much as its interval says."""
-    q, n = Reaction(inattention_probability=0.4, inattention_delay_s=2.5), 4000
-    seeds = [resolve(load_campaign("idm", [f"scenario={name}"])).scenario.seed for name in ("cut_in", *LADDERS)]
-    together = np.corrcoef([steps_late(q, n, seed=seed) > 0 for seed in seeds])
-    assert np.abs(together - np.eye(3)).max() < 4.0 / np.sqrt(n)
-
-
 CONTROLLER = "examples.idm:IDM"
 REFUSED = {
     "testing.method=step_mixture": r"testing\.method.*importance functions are those of cut-ins",

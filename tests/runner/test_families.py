@@ -8,6 +8,7 @@ import re
 import shutil
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
 import harness
@@ -19,8 +20,10 @@ from harness.families.words import ELSEWHERE, EXCLUDED
 from harness.numbers import number, share
 from harness.numbers import ratio as shown_ratio
 from harness.pool import moved
+from harness.pool.build import seed_of_paths
 from harness.printed import PRINTED
 from harness.progress import Progress
+from harness.random_stream import AV_DRAWS, INITIAL, uniforms
 from harness.records.folder import read_manifest, write_sealed
 from harness.report.rows import not_moved_words
 from harness.report.several import family_rows, hour_lines
@@ -94,6 +97,14 @@ def test_the_answer_is_the_sum_over_families_of_what_their_runs_say(run):
         assert times * shells["crash_rate"] == pytest.approx(part["rate_per_hour"], rel=1e-9)
         shown = (f"{number(times * shells[key])} per hour" for key in ("crash_rate", "ci_high", "upper_bound"))
         assert any(each in repr(alone) for each in shown)  # of a wide interval the limit
+
+
+def test_each_scenario_has_random_numbers_of_its_own():
+    """With the same, vehicles fail in the same tests of all, and pools err alike: the sum varies more than it says."""
+    resolved, n = [resolve(campaign().of_family(name)) for name in NAMES], 4000
+    for stream, seed_of in ((AV_DRAWS, lambda each: each.scenario.seed), (INITIAL, seed_of_paths)):
+        together = np.corrcoef([uniforms(seed_of(each), 0, n, stream, 1)[:, 0] for each in resolved])
+        assert np.abs(together - np.eye(3)).max() < 4.0 / np.sqrt(n)
 
 
 def test_workers_and_interruptions_change_no_bit(run, tmp_path):
