@@ -8,13 +8,12 @@ from __future__ import annotations
 import math
 import os
 import signal
-import threading
 from collections.abc import Callable, Coroutine, Generator, Iterable
 from dataclasses import dataclass, field
 from functools import partial
 from multiprocessing import parent_process
 from pathlib import Path
-from time import monotonic, sleep
+from time import monotonic
 from traceback import walk_tb
 from types import FrameType
 from typing import Any, ClassVar, Self
@@ -23,7 +22,13 @@ import numpy as np
 
 from harness.campaign.python_files import NOT_THE_USERS
 from harness.campaign.vehicle import AutomatedVehicle, Limits
-from harness.controllers.process_state import CHANGED_MODES, FloatingPointModes, OtherModules, closed_to_files
+from harness.controllers.process_state import (
+    CHANGED_MODES,
+    FloatingPointModes,
+    LastResort,
+    OtherModules,
+    closed_to_files,
+)
 from harness.controllers.protocol import (
     BatchController,
     BatchObservation,
@@ -118,6 +123,7 @@ class Guard:
     """
 
     _current: ClassVar[Guard | None] = None
+    _last_resort: ClassVar[LastResort | None] = None
     n_calls: ClassVar[int] = 0
     """Of all controllers of this process."""
 
@@ -130,8 +136,8 @@ class Guard:
         """Time that each constructor took."""
         self._makes, self._since = False, math.nan
         """Of the call under way, and when it began; NaN between calls: the harness itself may take its time."""
-        if parent_process() is not None:
-            threading.Thread(target=self._watch, name="controller watchdog", daemon=True).start()
+        if parent_process() is not None and not Guard._last_resort:
+            Guard._last_resort = LastResort(*HUNG_EXIT_CODES)
 
     def __enter__(self) -> Self:
         if Guard._current is not self:  # the handler stays: installing it costs more than a controller's step
@@ -142,11 +148,15 @@ class Guard:
     def __exit__(self, *_: object) -> None:
         self._since = math.nan
         signal.setitimer(signal.ITIMER_REAL, 0.0)
+        if self._last_resort:
+            self._last_resort.end()
 
     def limit(self, *, makes: bool) -> None:
         """From now to the end of ``with guard``, or of the next call: `StepTimeoutError` when the time is over."""
         self._makes, self._since = makes, monotonic()
         signal.setitimer(signal.ITIMER_REAL, self._limits[makes][0])
+        if self._last_resort:
+            self._last_resort.begin(makes, 2.0 * self._limits[makes][0] + 1.0, self._since)
 
     def call(
         self,
@@ -229,14 +239,6 @@ class Guard:
         if not math.isnan(self._since):
             raise StepTimeoutError(self._limits[self._makes][1])
 
-    def _watch(self) -> None:
-        """End the process when a call outlasts the exception that should have ended it."""
-        while True:
-            sleep(0.5)
-            since, makes = self._since, self._makes
-            if monotonic() - since > 2.0 * self._limits[makes][0] + 1.0:
-                os._exit(HUNG_EXIT_CODES[makes])
-
 
 def optional(name: str, *arguments: Any) -> Callable[[Any], None]:
     """Calls a controller's method of this name, if it has one."""
@@ -283,10 +285,10 @@ class VehicleHost(Host):
     def start(self, cells: IntArray, episodes: IntArray, announced: IntArray, set_speed_mps: FloatArray) -> Failures:
         """Begin episodes, ``announced`` to their controllers under these indices; returns those that failed at once."""
         failures = {}
-        with self.guard:
-            begun = cells.tolist(), episodes.tolist(), announced.tolist(), set_speed_mps.tolist()
-            for k, episode, index, set_speed in zip(*begun, strict=True):
-                wrong = self.before_test(episode)
+        begun = cells.tolist(), episodes.tolist(), announced.tolist(), set_speed_mps.tolist()
+        for k, episode, index, set_speed in zip(*begun, strict=True):
+            wrong = self.before_test(episode)  # may wait
+            with self.guard:
                 if wrong is None and self._controllers[k] is None:
                     self._controllers[k], wrong = self.guard.call(self.make, makes=True)
                 if wrong is None:
