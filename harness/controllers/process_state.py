@@ -70,7 +70,8 @@ class LastResort:
         self._set, self._begun = librt.timer_settime, dict[int, float]()
         for code, timer in zip(exit_codes, self._timers, strict=True):
             event = struct.pack(_SIGEVENT, code, 0, _IN_THREAD, ctypes.cast(librt._exit, ctypes.c_void_p).value)
-            librt.timer_create(time.CLOCK_MONOTONIC, event, ctypes.byref(timer))
+            if librt.timer_create(time.CLOCK_MONOTONIC, event, ctypes.byref(timer)):
+                raise MemoryError("for a thread")  # or a limit of the system
 
     def begin(self, kind: int, seconds: float, now: float) -> None:
         """A call of a kind begins ``now`` (s, monotonic) and may take so many ``seconds``."""
