@@ -155,7 +155,7 @@ class Pairs:
     def pool_variance(self, weights: FloatArray, worse: float = 0.0) -> float:
         """Variance of a weighted sum that comes from the pools' finite number of paths.
 
-        Pools of several scenarios count as independent, and none knows exactly how often a test has an event.
+        Pools of several scenarios are independent, and none knows exactly how often a test has an event.
         """
         variances = []
         for times, part in self._parts:

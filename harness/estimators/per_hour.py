@@ -2,7 +2,7 @@
 
 R = Σ_f e_f/p_f Σ_s p_fs θ_fs, e_f being how many events of a family there are in an hour, and p_f the probability of
 one in a test. Strata of all families stand side by side, so that limits are those of one likelihood ratio, and narrower
-than any sum of the families' own; pools are taken as independent: their variances add. Exposures e_f are taken as they
+than any sum of the families' own; pools are independent, so that their variances add. Exposures e_f are taken as they
 are: what is counted and what assumed is said beside the answer, and by what the ratio moves over the assumed ones.
 """
 
