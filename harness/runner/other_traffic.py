@@ -121,8 +121,10 @@ def traffic_error(moved: StoredShells, content: Mapping[str, Any], progress: Pro
     interval = estimate["ci_low"], estimate["ci_high"]
     if not estimate["n_crashes"] or not holds:
         interval = 0.0, estimate["upper_bound"]
-    args = factors, off, n_refused, confidence
-    rate = uncertain(estimate["crash_rate"], interval, *args, from_below=unseen is None and holds, held=holds)
+    below = unseen is None and holds
+    rate = uncertain(
+        estimate["crash_rate"], interval, factors, off, n_refused, confidence, from_below=below, held=holds
+    )
     drivers, ratios = [driver.name for driver in moved.design.references], {}
     for beside in estimate["details"]["references"]:
         driver = drivers.index(beside["reference"])
@@ -247,8 +249,9 @@ def _of_sum(folder: Path, ranges: Ranges, progress: Progress) -> Sensitivity:
             for bar in own.bars:
                 what = bar.what if bar.what.startswith(f"{name}.") else f"{name} {bar.what}"
                 bars.append(_part(replace(bar, what=what), *shares))
-    progress.remark, driver = "", stored["beside"]["reference"]
+    progress.remark = ""
     bars.sort(key=lambda bar: -bar.span)
+    driver = stored["beside"]["reference"]
     return Sensitivity(tests_of_sum(stored), "crashes per hour", driver, tuple(bars), tuple(not_moved))
 
 
@@ -300,7 +303,8 @@ def bar_of_readings(design: ShellDesign) -> list[Bar]:
     if not ratios:
         return []
     ratio = min([*ratios, 1.0]), max([*ratios, 1.0])
-    return [Bar(f"readings of {next(iter(rates))}", "assumed", None, (1.0, 1.0), ratio, (0.0, 0.0), len(ratios))]
+    what = f"readings of {next(iter(rates))}"
+    return [Bar(what, "assumed", None, rate=(1.0, 1.0), ratio=ratio, off=(0.0, 0.0), n=len(ratios))]
 
 
 def bar_of(move: Move, results: Sequence[Nearby | None]) -> Bar:
