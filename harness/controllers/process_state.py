@@ -22,7 +22,7 @@ from typing import Any
 WATCHED = (
     *("builtins", "functools", "hashlib", "io", "math", "json", "os", "pickle", "signal", "struct", "time", "zlib"),
     *("pathlib", "numpy", "pyarrow", "pyarrow.compute", "pyarrow.parquet"),
-    *("multiprocessing.connection", "multiprocessing.reduction"),
+    *("multiprocessing.connection", "multiprocessing.reduction", "multiprocessing.util", "threading"),
 )
 OURS = "harness", "numba", "llvmlite", "numpy"
 """Packages of which no module may be replaced."""
@@ -130,8 +130,8 @@ def closed_to_files() -> str:
 
 
 def _called_or_read(names: dict[str, Any]) -> dict[str, Any]:
-    kinds = float, type(sys), classmethod, staticmethod, property
-    return {k: v for k, v in names.items() if k[:2] != "__" and (callable(v) or type(v) in kinds)}
+    kinds, free = (float, type(sys), classmethod, staticmethod, property), ("__", "excepthook")  # a library's own hook
+    return {k: v for k, v in names.items() if not k.startswith(free) and (callable(v) or type(v) in kinds)}
 
 
 def _inherits(place: Any, name: str) -> bool:

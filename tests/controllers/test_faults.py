@@ -237,6 +237,7 @@ def test_check_refuses_what_run_refuses_and_makes_nothing_but_controllers(av, wh
         "pathlib.Path.read_bytes",
         "multiprocessing.reduction.ForkingPickler.dumps",
         "multiprocessing.connection.Connection.recv",
+        "threading.Condition",
         "sys.excepthook",
     ],
 )
