@@ -17,11 +17,12 @@ from collections.abc import Callable
 from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
+from types import FunctionType
 from typing import Any
 
 WATCHED = (
-    *("builtins", "functools", "hashlib", "io", "math", "json", "os", "pickle", "signal", "struct", "time", "zlib"),
-    *("pathlib", "numpy", "pyarrow", "pyarrow.compute", "pyarrow.parquet"),
+    *("builtins", "functools", "hashlib", "io", "math", "json", "os", "pickle", "signal", "struct", "sys", "time"),
+    *("zlib", "pathlib", "numpy", "pyarrow", "pyarrow.compute", "pyarrow.parquet"),
     *("multiprocessing.connection", "multiprocessing.reduction", "multiprocessing.util", "threading"),
 )
 OURS = "harness", "numba", "llvmlite", "numpy"
@@ -130,8 +131,9 @@ def closed_to_files() -> str:
 
 
 def _called_or_read(names: dict[str, Any]) -> dict[str, Any]:
-    kinds, free = (float, type(sys), classmethod, staticmethod, property), ("__", "excepthook")  # a library's own hook
-    return {k: v for k, v in names.items() if not k.startswith(free) and (callable(v) or type(v) in kinds)}
+    kinds = float, type(sys), classmethod, staticmethod, property
+    ours = {k: v for k, v in names.items() if k[:2] != "__" or isinstance(v, FunctionType)}
+    return {k: v for k, v in ours.items() if not k.endswith("hook") and (callable(v) or type(v) in kinds)}
 
 
 def _inherits(place: Any, name: str) -> bool:

@@ -235,6 +235,8 @@ def test_check_refuses_what_run_refuses_and_makes_nothing_but_controllers(av, wh
         "io.BytesIO",
         "hashlib.sha256",
         "pathlib.Path.read_bytes",
+        "pathlib.PurePath.__truediv__",
+        "sys.exc_info",
         "multiprocessing.reduction.ForkingPickler.dumps",
         "multiprocessing.connection.Connection.recv",
         "threading.Condition",
