@@ -22,7 +22,7 @@ from typing import Any
 
 WATCHED = (
     *("builtins", "functools", "hashlib", "io", "math", "json", "os", "pickle", "signal", "struct", "sys", "time"),
-    *("zlib", "pathlib", "numpy", "pyarrow", "pyarrow.compute", "pyarrow.parquet"),
+    *("zlib", "pathlib", "numpy", "numpy.random", "pyarrow", "pyarrow.compute", "pyarrow.parquet", "selectors"),
     *("multiprocessing.connection", "multiprocessing.reduction", "multiprocessing.util", "threading"),
 )
 OURS = "harness", "numba", "llvmlite", "numpy"
@@ -95,7 +95,7 @@ class OtherModules:
         watched = [name for name in self._loaded if name in WATCHED or name.partition(".")[0] == OURS[0]]
         places: dict[str, Any] = {name: self._loaded[name] for name in watched}
         types = [cls for module in places.values() for cls in vars(module).values() if isinstance(cls, type)]
-        packages = OURS[0], "pathlib", "multiprocessing"
+        packages = OURS[0], "pathlib", "multiprocessing", "selectors"
         ours = [cls for one in types for cls in one.__mro__ if cls.__module__.partition(".")[0] in packages]
         places |= {f"{cls.__module__}.{cls.__qualname__}": cls for cls in ours}
         self._kept = {name: (place, _called_or_read(vars(place)), set(vars(place))) for name, place in places.items()}

@@ -240,6 +240,8 @@ def test_check_refuses_what_run_refuses_and_makes_nothing_but_controllers(av, wh
         "multiprocessing.reduction.ForkingPickler.dumps",
         "multiprocessing.connection.Connection.recv",
         "threading.Condition",
+        "numpy.random.Generator",
+        "selectors.PollSelector.select",
         "sys.excepthook",
     ],
 )
