@@ -259,7 +259,7 @@ def _made(make: Callable[[], Any], name: str, guard: Guard) -> Any:
 
 
 def _not_made(name: str, why: str) -> CampaignError:
-    mend = "Fix it, or give what it needs: --set av.parameters.NAME=… (files relative to the current folder)."
+    mend = "Fix it, or work where the files are that it reads; a new run may name others: --set av.parameters.NAME=…"
     return CampaignError("av.controller", f"{name}, which cannot be made: {why}", "a controller", mend)
 
 

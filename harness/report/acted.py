@@ -63,7 +63,7 @@ def acted_words(scenario: str, before: Mapping[str, Any] | None) -> Iterator[str
             sees = " ".join(shown.shows)
             yield f"SUMO changes lanes in one step: this vehicle cannot see that {sees}, as drivers can"
         else:
-            n_early = before["n_braked_early" if follows else "n_took_over_early"]
+            n_early = min(before["n_braked_early"], before["n_took_over_early"])  # it may drive from the onset on
             yield from filter(None, [late_words(scenario, n_early, before["n_events"], script=script is not None)])
     if not before["waits"]:
         return

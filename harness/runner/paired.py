@@ -92,7 +92,8 @@ def drive_pairs(
             scenarios = [PairedScenario(folder, a, b, campaign.exposure) for folder, a, b in folder_and_runs]
             available = [scenario.runs[0].prescribed.available for scenario in scenarios]
             rounds = PairRounds(campaign, together(scenarios, campaign), available, rule)
-            progress.stage("tests of A and B", 2 * campaign.stop.episodes if rule.ends_at_rhw else None)
+            kept = sum(underway.run.earlier.n_episodes for underway in runs)
+            progress.stage("tests of A and B", 2 * campaign.stop.episodes if rule.ends_at_rhw else None, done=kept)
             for scenario in scenarios:
                 scenario.take_over(rule)
             while np.concatenate(added := rounds.next_round(together(scenarios, campaign))).any():

@@ -7,6 +7,7 @@ from collections import defaultdict
 from dataclasses import asdict, replace
 from pathlib import Path
 from types import SimpleNamespace
+from unittest.mock import ANY, Mock, call
 
 import pytest
 
@@ -14,6 +15,7 @@ from harness.cli import main
 from harness.errors import CampaignError, RunFolderError
 from harness.estimators.pairs import PairDecision
 from harness.numbers import ratio
+from harness.progress import Progress
 from harness.report.several import deciding_words, pair_warnings, pair_words
 from harness.runner.compare import _decided, compare_campaigns
 from harness.runner.tables import read
@@ -149,9 +151,16 @@ def test_an_interrupted_comparison_goes_on(done, campaigns, tmp_path, monkeypatc
     with pytest.raises(KeyboardInterrupt):
         compare_campaigns(*campaigns, tmp_path, workers=1, rhw=0.15)
     assert manifest(tmp_path / "a")["status"] == manifest(tmp_path / "b")["status"] == "interrupted"
-    for _ in range(2):  # what is finished is not driven again
-        assert compare_campaigns(*campaigns, tmp_path, workers=1, rhw=0.15).content == done.content
+    for held in (True, False):  # what is finished is not driven again
+        progress, n_kept = (
+            Mock(Progress, cancelled=False, remark=""),
+            sum(manifest(tmp_path / side)["n_episodes"] for side in "ab"),
+        )
+        found = compare_campaigns(*campaigns, tmp_path, workers=1, rhw=0.15, progress=progress)
+        assert found.content == done.content
         assert sum(driven) == 2 * done.content["n_pairs"]
+        assert call("tests of A and B", ANY, done=n_kept) in progress.stage.mock_calls
+        assert held == (n_kept < sum(driven))
 
 
 @pytest.mark.parametrize(("swapped", "verdict", "exit_code"), [(False, "proven", 0), (True, "refuted", 5)])

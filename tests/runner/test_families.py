@@ -442,7 +442,7 @@ def test_what_the_vehicle_did_before_bv_came_is_said_as_in_the_answer_of_one_sce
     of = run.content["families"]
     assert of["cut_in"]["before_event"]["built_in"]
     for early, but in ((0, ""), (5, "in all but 5 tests "), (6, None)):
-        acted = {**of["cut_in"]["before_event"], "n_braked_before": 1234, "n_took_over_early": early, "n_events": 50}
+        acted = {**of["cut_in"]["before_event"], "n_braked_before": 1234, "n_braked_early": early, "n_events": 50}
         content = {**run.content, "families": {**of, "cut_in": {**of["cut_in"], "before_event": acted}}}
         told = " ".join(" ".join(hour_lines(content)).split())
         assert "! cut-in: in 1,234 tests it braked with nobody ahead" in told
