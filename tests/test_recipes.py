@@ -97,6 +97,11 @@ def test_a_new_criticality_is_a_function_in_a_file(tmp_path):
     assert nade["crash_rate"] == pytest.approx(1.352e-7, rel=0.1)
 
 
+def test_the_diff_of_a_new_controller_kind_fits_the_code():
+    apply = ["git", "apply", "--check", "--unidiff-zero", "examples/new_controller_kind.diff"]
+    subprocess.run(apply, cwd=ROOT, check=True)
+
+
 @pytest.mark.slow
 def test_a_new_controller_kind_is_three_files(tmp_path):
     recipe = laid_out("A new controller kind", tmp_path)

@@ -271,8 +271,11 @@ def deciding_words(content: Mapping[str, Any], s_per_pair: float | None = None) 
     decision = content["decision"]
     if decision["verdict"] != "open" or content.get("ended") == "sum":
         return None
-    if decision["margin"] is not None and (decision["n_milder"] or decision["n_differing"]):  # no pairs mend that
-        return None
+    if decision["n_milder"] or decision["n_differing"]:  # no pairs mend that
+        if decision["margin"] is not None:
+            return None
+        if content["difference"] > 0.0:
+            return "first mend what ! says: until then no number of pairs proves that B is the safer one"
     if not content["n_only_a"] + content["n_only_b"]:
         return "in no pair of tests did only one crash"
     if (needed := content["to_decide"]) is None:

@@ -55,6 +55,9 @@ def test_the_numbers_are_those_of_the_comparison(compared, page):
         "--margin 0 and a new --out, and without --set stop.rhw, if you gave it: about 90,000 pairs"
         in deciding_words(left_open)
     )
+    doubted = {**left_open, "difference": 1e-9, "decision": {**left_open["decision"], "n_milder": 7}}
+    assert deciding_words(doubted).startswith("first mend what ! says: until then no number of pairs")
+    assert deciding_words(doubted | {"difference": -1e-9}) == deciding_words(left_open | {"difference": -1e-9})
     assert not any(found[side]["details"]["within"]["n_crashes_outside"] for side in "ab")
     most = max(found[side]["details"]["within"]["upper_bound_outside"] for side in "ab")
     for apart, told in ((0.9 * most, True), (1.1 * most, False)):  # less than, or more than, what nobody saw may weigh
