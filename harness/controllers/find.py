@@ -7,6 +7,7 @@ import math
 import os
 import re
 import sys
+import traceback
 from collections.abc import Callable, Iterable
 from contextlib import suppress
 from copy import deepcopy
@@ -30,7 +31,16 @@ from harness.campaign.python_files import (
     is_users,
 )
 from harness.campaign.vehicle import AutomatedVehicle
-from harness.controllers.hosts import BatchHost, BeforeTest, ControllerHost, Guard, VehicleHost, cause_of, death_cause
+from harness.controllers.hosts import (
+    BatchHost,
+    BeforeTest,
+    ControllerHost,
+    Guard,
+    VehicleHost,
+    cause_of,
+    death_cause,
+    require_ours,
+)
 from harness.controllers.traci_style import WAITS, StepListenerController, TriedScript
 from harness.errors import EXIT_TOO_MANY_FAILED, CampaignError, HarnessError
 from harness.files import real_path
@@ -268,6 +278,24 @@ def has_foreign_code(av: AutomatedVehicle) -> bool:
     return av.source in ("controller", "fmu")
 
 
+def in_words(av: AutomatedVehicle, work: Callable[[], _Answer]) -> _Answer:
+    """Do some work in the process of an AV; what foreign code there breaks of the harness is a `CampaignError`."""
+    try:
+        return work()
+    except (HarnessError, MemoryError):
+        raise
+    except Exception as error:
+        if not has_foreign_code(av):
+            raise
+        require_ours(error)
+        if isinstance(error, OSError):  # a full disk, say
+            raise
+        found = f"a vehicle after whose code the harness fails in its process: {type(error).__name__}: {error}"
+        sys.stderr.write(f"{found}\n{''.join(traceback.format_exception(error))}")  # a run keeps what is printed
+        mend = "Leave all but your own objects as they are. If --av idm fails, too, report it, with what was printed."
+        raise CampaignError(f"av.{av.source}", found, "code that changes its own objects alone", mend) from error
+
+
 def run_apart(av: AutomatedVehicle, work: Callable[..., _Answer], *arguments: Any) -> _Answer:
     """Call ``work(*arguments)``, which runs an AV, in a process of its own where that `has_foreign_code`.
 
@@ -275,7 +303,7 @@ def run_apart(av: AutomatedVehicle, work: Callable[..., _Answer], *arguments: An
     """
     if not has_foreign_code(av):
         return work(*arguments)
-    child = Child(tell, partial(work, *arguments))
+    child = Child(tell, partial(in_words, av, partial(work, *arguments)))
     try:
         answer = first_to_answer([child]).answer()
     finally:

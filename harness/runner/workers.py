@@ -18,8 +18,8 @@ from typing import Any, TypeVar
 
 from scipy.special import bdtrc
 
-from harness.controllers.find import has_foreign_code
-from harness.controllers.hosts import death_cause, require_ours
+from harness.controllers.find import has_foreign_code, in_words
+from harness.controllers.hosts import death_cause
 from harness.errors import HarnessError, TooManyFailedError
 from harness.estimators.block import Block
 from harness.loop.loop import EpisodeLoop
@@ -71,16 +71,11 @@ def serve(connection: Connection, resolved: Resolved, baseline: Path) -> None:
             runner.close()
             runner = None
         runner = runner or ShardRunner(resolved, baseline, connection if alone else None)
-        try:
-            return runner.run(request, fatal)
-        except Exception as error:  # as of a signal's handler that the vehicle has left
-            if not isinstance(error, HarnessError):
-                require_ours(error)
-            raise
+        return runner.run(request, fatal)
 
     with suppress(EOFError, OSError):
         while True:
-            tell(connection, partial(run, *connection.recv()))
+            tell(connection, partial(in_words, resolved.campaign.av, partial(run, *connection.recv())))
     if runner is not None:
         runner.close()
 

@@ -6,17 +6,19 @@ import signal
 from contextlib import nullcontext
 from pathlib import Path
 from types import SimpleNamespace
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
 
 from benchmarks.kills import orphans
+from harness.campaign.files import load_campaign
 from harness.campaign.vehicle import Limits
 from harness.cli import main
-from harness.controllers.find import build_host
+from harness.controllers.find import build_host, in_words
 from harness.controllers.hosts import Guard, _numbers, optional, require_ours
 from harness.controllers.protocol import Neighbour
-from harness.errors import EXIT_BAD_INPUT, EXIT_DONE, EXIT_TOO_MANY_FAILED, CampaignError
+from harness.errors import EXIT_BAD_INPUT, EXIT_DONE, EXIT_TOO_MANY_FAILED, CampaignError, HarnessError
 from harness.printed import PRINTED
 from harness.runner.workers import LocalWorkers
 from tests.controllers.misbehaving import Learned
@@ -264,6 +266,25 @@ def test_what_the_users_code_raises_between_its_calls_is_named_and_our_own_error
     with pytest.raises(CampaignError, match=r"that raises between its calls: OSError: too late \(test_faults"):
         require_ours(raised.value)
     require_ours(ValueError("of the harness, without a line of theirs"))
+
+
+@pytest.mark.parametrize(
+    ("av", "error", "told"),
+    [
+        (_of("Global"), TypeError("spoilt"), CampaignError),
+        (_of("Global"), OSError("disk full"), OSError),
+        (_of("Global"), HarnessError("a", "b", "c", "d"), HarnessError),
+        ("{model: idm}", TypeError("a defect"), TypeError),
+    ],
+)
+def test_what_foreign_code_breaks_of_the_harness_is_told_in_words(av, error, told, capsys):
+    """In a worker: as a plain value that the harness reads, set to None. A defect beside a built-in model is one."""
+    with pytest.raises(told) as raised:
+        in_words(load_campaign("idm", [f"av={av}"]).av, Mock(side_effect=error))
+    assert (told is type(error)) == (raised.value is error)
+    if told is CampaignError:
+        assert "after whose code the harness fails in its process: TypeError: spoilt" in str(raised.value)
+        assert "TypeError: spoilt" in capsys.readouterr().err.splitlines()[-1]
 
 
 @pytest.mark.parametrize(
