@@ -244,7 +244,7 @@ def test_errors_reach_the_parent(error, at, tmp_path, monkeypatch):
         recv=Mock(side_effect=[(ShardRequest(0, 0, 10), {}, False), EOFError]),
         send=lambda answer: answers.append(pickle.loads(pickle.dumps(answer))),
     )
-    workers.serve(pipe, campaign(), tmp_path)
+    workers.serve(pipe, SimpleNamespace(campaign=campaign()), tmp_path)
     (found,) = answers
     assert type(found) is (RuntimeError if error is None else type(error))
     assert str(error or "ValueError: of a strange kind") in str(found)
