@@ -254,7 +254,7 @@ REFUSED = (
     Combination(
         "exposure", lambda c, _: bool(c.exposure) and c.scenarios is None,
         "{exposure}, with one scenario", "events per hour of those that are tested",
-        "Add --scenario all (scenarios: [cut_in, lead_brakes, cut_out]), or delete it: one alone has the shipped one.",
+        "Add --scenario all (scenarios: [cut_in, lead_brakes, cut_out]), or delete it: one has that of its traffic.",
     ),
     Combination(
         "environments",

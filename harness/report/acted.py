@@ -44,7 +44,8 @@ def script_words(tried: Mapping[str, float] | None) -> Iterator[str]:
         left = f"the script gives no command for {left_s:.1f} s behind a car that cuts in (tried for 15 s)"
         yield f"{left}: SUMO’s model would drive then, here it keeps its speed (docs/controllers.md)"
     if tried is not None and tried["safe_speeds"]:
-        yield "in its speed mode SUMO’s safe speeds would hold the script back; here they do not (docs/controllers.md)"
+        holds = "in the script’s speed mode SUMO’s safe speeds would hold the vehicle back; here they do not"
+        yield f"{holds} (docs/controllers.md)"
 
 
 def acted_words(scenario: str, before: Mapping[str, Any] | None) -> Iterator[str]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sized
 from pathlib import Path
 from typing import Any
@@ -145,11 +146,14 @@ def sum_warnings(content: Mapping[str, Any]) -> Iterator[str]:
             times, interval = ratio_words(reading)
             times = f"{times} ({interval})" if reading["ratio"] else interval.replace("0 to", "<") or times
             yield f"beside {reading['reference']}, another reading of UN R157, it is × {times}"
+    said = defaultdict[str, list[str]](list)  # what holds of several is said once
     for name, family in content["families"].items():
         texts = list(words.warnings_of(name, {**family, "rate": family["rate_per_hour"]}, " per hour"))
         if (unseen := _unseen(family)) is not None:
             texts.append(f"{words.unseen_words(unseen[0])}, here {number(unseen[1])} per hour")
-        yield from (f"{called(name)}: {text}" for text in texts)
+        for text in texts:
+            said[text].append(called(name))
+    yield from (f"{', '.join(names)}: {text}" for text, names in said.items())
 
 
 def _unseen(family: Mapping[str, Any]) -> tuple[str, float] | None:

@@ -299,7 +299,7 @@ def read_families(folder: Path) -> dict[str, Any]:
     """``families.json`` of a folder; a `RunFolderError` where it is missing, damaged, or another version's."""
     if not (folder / FAMILIES).is_file():
         found, expected = "a comparison, or a run of one scenario", "a folder of several, which has families.json"
-        mend = "Leave out --exposure: one scenario has the shipped one, and compare takes --set exposure.lead_brakes=…"
+        mend = "Leave out --exposure: one scenario has that of its traffic; compare takes --set exposure.lead_brakes=…"
         raise RunFolderError(str(folder), found, expected, mend)
     return read_as(dict[str, Any], folder / FAMILIES, mend=MEND, key="families")
 

@@ -336,7 +336,7 @@ def test_a_script_that_sumos_safe_speeds_would_hold_back_is_told_that_here_they_
     (tmp_path / "my.py").write_text(text(f"{sets or 'pass'}\n    {drives}"), "utf-8")
     tried = tried_script(load_campaign(str(tmp_path / "my.py")).av)
     assert (tried.safe_speeds, tried.accel_mps2, tried.decel_mps2) == (bounded, 2.6, 6.0)
-    assert ["safe speeds would hold" in words for words in script_words(tried._asdict())] == [True] * bounded
+    assert ["safe speeds would hold the" in words for words in script_words(tried._asdict())] == [True] * bounded
 
 
 def test_a_stored_answer_is_the_same_when_the_script_has_gone_or_is_broken(tmp_path):

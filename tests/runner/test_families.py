@@ -447,6 +447,13 @@ def test_what_the_vehicle_did_before_bv_came_is_said_as_in_the_answer_of_one_sce
         told = " ".join(" ".join(hour_lines(content)).split())
         assert "! cut-in: in 1,234 tests it braked with nobody ahead" in told
         assert (f"! cut-in: {but}it did nothing before the other car" in told) == (but is not None)
+    script = {"idle_s": 0.0, "left_s": 0.0, "safe_speeds": True}
+    all_of = {
+        name: {**each, "before_event": {**each["before_event"], "tried_script": script}} for name, each in of.items()
+    }
+    told = " ".join(" ".join(hour_lines({**run.content, "families": all_of})).split())
+    assert told.count("! cut-in, lead brakes, cut-out: in the script’s speed mode SUMO’s safe speeds would hold") == 1
+    assert told.count("safe speeds") == 1
     brakes = {**of["lead_brakes"]["before_event"], "built_in": False, "n_events": 50}
     for n, warned in ((6, True), (5, False)):
         part = {**of["lead_brakes"], "before_event": {**brakes, "n_fell_behind": n}, "share_below_1_mps": 0.1 * n}
