@@ -222,8 +222,9 @@ def _told(fit: Fit, tally: BesideCounts, request: FitRequest, noise_mps2: float)
     )
     limited = f"! no lane change seen at {unseen}: rates of crashes that begin there have only an upper limit"
     return (
-        f"{traffic.n_recordings:,} recordings, {tally.vehicles:,} vehicles, {tally.driven_s / 3600.0:.2f} h beside the "
-        f"target lane; {tally.used:,} lane changes to the {side} used of {tally.changes:,}",
+        f"{traffic.n_recordings:,} recording{'s' * (traffic.n_recordings != 1)}, {tally.vehicles:,} vehicles, "
+        f"{tally.driven_s / 3600.0:.2f} h beside the target lane; {tally.used:,} lane changes to the {side} used of "
+        f"{tally.changes:,}",
         f"in front of a vehicle that closes in within 8 s: {int(steps.events[:-1].sum()):,} lane changes; "
         f"{steps.exposure[:-1].sum():.1f} expected if nobody minded it",
         *(f"kept as in {BASE}: {subject} ({why})" for subject, why in fit.kept.items()),
