@@ -215,7 +215,8 @@ def _server() -> Iterator[None]:
     short = _in_short(temporary_folder())
     main, sys.modules["__main__"] = sys.modules["__main__"], ModuleType("__main__")
     before, tempfile.tempdir = tempfile.tempdir, short
-    masked = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # it would end with a traceback
+    # SIGINT would end it with a traceback; without others, which this process may have been started without, it waits.
+    masked = signal.pthread_sigmask(signal.SIG_SETMASK, {signal.SIGINT})
     removed = {name: os.environ.pop(name) for name in (SAFE_PATH, "PYTHONHASHSEED") if name in os.environ}
     os.environ[SAFE_PATH] = "1"  # a json.py of the current folder is not what the server imports
     try:
